@@ -57,13 +57,11 @@ def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report:
 
     reconstruction: Reconstruction = inputs["sfm"]
     finite: NDArray[np.bool_] = np.all(np.isfinite(reconstruction.points), axis=1)
-    keep = finite.copy()
     reasons: dict[str, NDArray[np.bool_]] = {"not_finite": ~finite}
     if not settings.keep_outliers and finite.any():
         reasons |= _outliers(reconstruction, finite)
-        for outliers in reasons.values():
-            keep &= ~outliers
-    _report_outliers(reasons, len(reconstruction.points), report)
+    keep = ~np.logical_or.reduce(list(reasons.values()))
+    _report_outliers(reasons, keep, report)
     points = reconstruction.points[keep]
     if len(points) < _FEWEST_SPLATS:
         raise _too_few(len(points), len(reconstruction.points))
@@ -170,11 +168,11 @@ def _camera_centres(reconstruction: Reconstruction) -> NDArray[np.float64]:
     return np.array([view.camera.centre for view in reconstruction.views]).reshape(-1, 3)
 
 
-def _report_outliers(reasons: dict[str, NDArray[np.bool_]], points: int, report: Report) -> None:
-    import numpy as np
-
+def _report_outliers(
+    reasons: dict[str, NDArray[np.bool_]], keep: NDArray[np.bool_], report: Report
+) -> None:
     counts = {reason: int(mask.sum()) for reason, mask in reasons.items()}
-    total = int(np.logical_or.reduce(list(reasons.values())).sum()) if reasons else 0
+    points, total = len(keep), int((~keep).sum())
     report.metric("points", points)
     report.metric("outliers", total)
     report.metric("outliers_by_reason", counts)

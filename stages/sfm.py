@@ -198,13 +198,13 @@ def _from_photographs(
     )
     report.metric("attempts", [acceptance.attempt_metrics(attempt) for attempt in attempts])
     model = acceptance.accepted_model(attempts, capture, settings.allow_partial, settings.features)
-    acceptance.report_warnings(attempts, capture, report, settings.features)
-    known_scale = metric_scale.KnownScale(settings.scale, settings.marker, crs=settings.crs)
+    acceptance.report_warnings(attempts, model, capture, report, settings.features)
+    known_scale = metric_scale.KnownScale(settings.scale, settings.marker, settings.crs)
     found = finish.finish(model, capture, folder, report, known_scale)
     best = fallbacks.best_attempt(attempts)
     _report_model(found, best.statistics.mean_reprojection_error_px, capture, report)
     acceptance.report_metrics(best, model, report)
-    acceptance.report_joined(attempts, capture, report)
+    acceptance.report_joined(attempts, model, capture, report)
     return found, runner.seconds
 
 
@@ -227,10 +227,7 @@ def _from_known_cameras(
         allow_partial=settings.allow_partial,
         seed=settings.seed,
         max_features=settings.max_features,
-        known_scale=KnownScale(
-            *(settings.scale, settings.marker, float(settings.metres), "--metres"),
-            crs=settings.crs,
-        ),
+        known_scale=KnownScale(settings.scale, settings.marker, settings.crs, settings.metres),
         seconds_left=lambda: deadline - time.monotonic(),
     )
     _report_model(found, float(found.errors_px.mean()), capture, report)

@@ -16,7 +16,6 @@ from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:
     from stages.cameras.camera_file import CameraFile
-    from stages.cameras.colmap import ColmapModel
 
 
 def cameras(
@@ -33,9 +32,16 @@ def cameras(
     written with them. nerfstudio's world is z up; COLMAP's is y down, as in a run.
     """
     from stages.cameras import colmap, nerfstudio
+    from stages.cameras.camera_file import NO_POINTS
+    from stages.cameras.table import read_cameras
 
     to_nerfstudio = _is_json(out)
-    found, model = _read(source)
+    source = _model_of_run(source) if runfolder.is_run_folder(source) else source
+    model = colmap.locate(source)
+    if model is None:
+        found, cloud, observations = read_cameras(source), NO_POINTS, colmap.NO_OBSERVATIONS
+    else:
+        found, cloud, observations = colmap.read_model(model)
     if found.distorted:
         raise SplatError(
             "cameras-distorted",
@@ -45,17 +51,18 @@ def cameras(
         )
     pictures = found.folder
     if to_nerfstudio:
-        points = (model.points, model.colours) if model is not None else (None, None)
-        nerfstudio.write(out, found.views, pictures, *points)
+        nerfstudio.write(out, found.views, pictures, cloud.points, cloud.colours)
     else:
+        names = [view.name for view in found.views]
         if model is None:
-            model, pictures = _without_points(found)
+            names, pictures = _names_in_one_folder(found)
         make_folder(out)
-        colmap.write_colmap_model(out, model)
+        cameras = [view.camera for view in found.views]
+        colmap.write_model(out, names, cameras, cloud, observations)
     facts = {
         "out": str(out),
         "cameras": len(found.views),
-        "points": len(model.points) if model is not None else 0,
+        "points": len(cloud.points),
         "pictures": str(pictures),
         "pictures_found": (found.folder / found.views[0].image).is_file(),
     }
@@ -87,31 +94,20 @@ def _is_json(out: Path) -> bool:
     )
 
 
-def _read(source: Path) -> tuple[CameraFile, ColmapModel | None]:
-    """(the cameras, the COLMAP model with its points or None)."""
-    from stages.cameras.colmap import locate, read_model
-    from stages.cameras.table import read_cameras
-
-    if runfolder.is_run_folder(source):
-        pipeline = Pipeline(source)
-        if pipeline.manifest("sfm") is None:
-            raise UsageError(
-                "no-cameras-yet",
-                given=f"No cameras of {source} have been found yet.",
-                wanted="A run in which `sfm` has finished.",
-                hint="Run `splat process` to go on.",
-            )
-        source = pipeline.stage_folder("sfm") / "colmap"
-    folder = locate(source)
-    return (read_cameras(source), None) if folder is None else read_model(folder)
+def _model_of_run(run: Path) -> Path:
+    pipeline = Pipeline(run)
+    if pipeline.manifest("sfm") is None:
+        raise UsageError(
+            "no-cameras-yet",
+            given=f"No cameras of {run} have been found yet.",
+            wanted="A run in which `sfm` has finished.",
+            hint="Run `splat process` to go on.",
+        )
+    return pipeline.stage_folder("sfm") / "colmap"
 
 
-def _without_points(found: CameraFile) -> tuple[ColmapModel, Path]:
-    """(a model without points, the innermost folder that holds all pictures)."""
-    from stages.cameras.colmap import ColmapModel
-
+def _names_in_one_folder(found: CameraFile) -> tuple[list[str], Path]:
+    """(names of the pictures, the innermost folder that holds all of them)."""
     paths = [os.path.normpath(found.folder / view.image) for view in found.views]
     root = os.path.commonpath([os.path.dirname(path) for path in paths])
-    names = tuple(Path(path).relative_to(root).as_posix() for path in paths)
-    model = ColmapModel(names, tuple(view.camera for view in found.views))
-    return model, Path(root)
+    return [Path(path).relative_to(root).as_posix() for path in paths], Path(root)

@@ -20,17 +20,17 @@ from stages.base.bad_files import CAMERAS, BadFileError, reading
 from stages.cameras.camera_file import (
     CameraFile,
     Georeference,
-    cameras_of,
+    camera_file,
     json_of,
+    picture_beside,
     poses_of,
     stored_size,
 )
 from stages.cameras.lens import PINHOLE
-from stages.cameras.nerfstudio import OPENGL_FROM_OURS
+from stages.cameras.nerfstudio import OPENGL_FROM_OURS, required
 
 _FRAMES = "frame_*.json"
 _POLYCAM = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
-_SUFFIXES = (".jpg", ".jpeg", ".png", ".heic")
 _CENTRE = 0.5  # ARKit counts pixels from the centre of the first one, we from its corner
 _UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # ahead stands for north
 _SESSION = Georeference(1.0, _UP, "ARKit's tracking")
@@ -57,7 +57,7 @@ def read(path: Path) -> CameraFile:
     images = dict(_POLYCAM).get(path.name)
     files = sorted(path.glob("*.json" if images else _FRAMES))
     pictures = path.parent / images if images else path
-    found = {file: _picture(pictures, file.stem) for file in files}
+    found = {file: picture_beside(pictures / file.name) for file in files}
     with_picture = [file for file in files if found[file] is not None] or files
     posed = []
     for file in with_picture:
@@ -70,21 +70,16 @@ def read(path: Path) -> CameraFile:
     with reading(with_picture[0], CAMERAS):
         names = [getattr(found[file], "name", file.stem) for file in with_picture]
         to_world = np.array([pose for _, pose in posed])
-        with np.errstate(all="ignore"):  # `make_views` checks the result
+        with np.errstate(all="ignore"):  # `camera_file` checks the result
             rotations = OPENGL_FROM_OURS @ to_world[:, :, :3].transpose(0, 2, 1)
         poses = poses_of(rotations, to_world[:, :, 3])
-        views, lenses = cameras_of(names, [(values, PINHOLE) for values, _ in posed], poses)
-        return CameraFile(views, pictures, lenses, _SESSION)
-
-
-def _picture(folder: Path, stem: str) -> Path | None:
-    near = (folder / f"{stem}{suffix}" for suffix in _SUFFIXES)
-    return next((path for path in near if path.is_file()), None)
+        optics = [(values, PINHOLE) for values, _ in posed]
+        return camera_file(pictures, names, optics, poses, _SESSION)
 
 
 def _scanner_app(frame: dict[str, Any], picture: Path | None) -> Posed:
-    intrinsics = np.array(_required(frame, "intrinsics"), np.float64)
-    pose = np.array(_required(frame, "cameraPoseARFrame"), np.float64)
+    intrinsics = np.array(required(frame, "intrinsics"), np.float64)
+    pose = np.array(required(frame, "cameraPoseARFrame"), np.float64)
     if intrinsics.size != 9 or pose.size != 16:
         raise BadFileError("intrinsics are not 9 numbers, or the pose is not 16")
     (fx, _, cx), (_, fy, cy), _ = intrinsics.reshape(3, 3).tolist()
@@ -96,11 +91,5 @@ def _scanner_app(frame: dict[str, Any], picture: Path | None) -> Posed:
 
 def _polycam(frame: dict[str, Any], _: Path | None) -> Posed:
     names = ("width", "height", "fx", "fy", "cx", "cy")
-    pose = [[float(_required(frame, f"t_{i}{j}")) for j in range(4)] for i in range(3)]
-    return [float(_required(frame, name)) for name in names], np.array(pose)
-
-
-def _required(frame: dict[str, Any], key: str) -> Any:
-    if key not in frame:
-        raise BadFileError(f"it has no {key}")
-    return frame[key]
+    pose = [[float(required(frame, f"t_{i}{j}")) for j in range(4)] for i in range(3)]
+    return [float(required(frame, name)) for name in names], np.array(pose)

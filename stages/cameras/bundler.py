@@ -15,9 +15,9 @@ from stages.base.bad_files import CAMERAS, BadFileError, reading
 from stages.cameras.camera_file import (
     CameraFile,
     FilePoints,
+    camera_file,
     content_of,
     file_points,
-    make_views,
     size_of_picture,
 )
 from stages.cameras.lens import Lens
@@ -36,17 +36,16 @@ def read(path: Path) -> CameraFile:
         registered = cameras[:, 0] != 0  # Bundler writes a focal length of 0 for the others
         names = [name for name, there in zip(names, registered, strict=True) if there]
         cameras = cameras[registered]
-        sizes = np.array(
-            [size_of_picture(path.parent, name) for name in names], np.float64
-        ).reshape(-1, 2)
-        lens = np.concatenate([cameras[:, :1], cameras[:, :1], sizes / 2], axis=1)
+        sizes = [size_of_picture(path.parent, name) for name in names]
+        optics = [
+            ((width, height, f, f, width / 2, height / 2), Lens(radial=(k1, k2)))
+            for (width, height), (f, k1, k2) in zip(sizes, cameras[:, :3].tolist(), strict=True)
+        ]
         with np.errstate(all="ignore"):
             rotations = OPENGL_FROM_OURS @ cameras[:, 3:12].reshape(-1, 3, 3)
             shifts = cameras[:, 12:] @ OPENGL_FROM_OURS
         poses = np.concatenate([rotations, shifts[:, :, None]], axis=2)
-        views = make_views(names, sizes, lens, poses)
-        lenses = tuple(Lens(radial=(float(k1), float(k2))) for k1, k2 in cameras[:, 1:3])
-        return CameraFile(views, path.parent, lenses)
+        return camera_file(path.parent, names, optics, poses)
 
 
 def read_points(path: Path) -> FilePoints | None:

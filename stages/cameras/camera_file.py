@@ -25,6 +25,7 @@ MAX_FILE_BYTES = 1 << 30  # cameras and points of thousands of photographs take 
 MAX_SIDE_PX = 100_000
 MAX_DISTANCE = 1e12  # world units; its square is far from overflowing
 ROTATION_TOLERANCE = 1e-3  # of R^T R, for text with three decimals
+_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".heic")  # of pictures
 _EXACT = 1e-9  # of R^T R: a larger error is not rounding of float64
 
 
@@ -88,6 +89,11 @@ class FilePoints:
     tracks: NDArray[np.int32]
 
 
+NO_POINTS = FilePoints(
+    np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), np.zeros(0, np.int32)
+)
+
+
 def file_points(
     points: NDArray[np.floating],
     colours: NDArray[Any] | None = None,
@@ -111,26 +117,28 @@ def file_points(
     )
 
 
-def make_views(
+def camera_file(
+    folder: Path,
     names: Sequence[str],
-    sizes: NDArray[np.floating],
-    intrinsics: NDArray[np.float64],
-    world_to_camera: NDArray[np.float64],
-) -> tuple[View, ...]:
-    """Checked views from plain arrays.
+    optics: Sequence[Optics],
+    poses: NDArray[np.float64],
+    georeference: Georeference = NO_GEOREFERENCE,
+) -> CameraFile:
+    """The checked cameras of a file.
 
     Args:
+        folder, georeference: as in `CameraFile`.
         names: V names.
-        sizes: [V, 2] width and height, pixels.
-        intrinsics: [V, 4] fx, fy, cx, cy, pixels.
-        world_to_camera: [V, 3 or 4, 4]; rounded rotations are made orthogonal.
+        optics: V.
+        poses: [V, 3, 4] world to camera; rounded rotations are made orthogonal.
 
     Raises:
         BadFileError: there is no camera, or one is invalid.
     """
     if not len(names):
         raise BadFileError("it holds no camera")
-    poses = np.asarray(world_to_camera, np.float64)[:, :3]
+    numbers = np.array([values for values, _ in optics], np.float64).reshape(-1, 6)
+    sizes, intrinsics = numbers[:, :2], numbers[:, 2:]
     _refuse(names, ~((sizes >= 1) & (sizes <= MAX_SIDE_PX)).all(1), "a size in pixels")
     bad = ~np.isfinite(intrinsics).all(1) | (intrinsics[:, :2] <= 0).any(1)
     _refuse(names, bad, "a focal length and a principal point")
@@ -145,24 +153,16 @@ def make_views(
     matrices = np.tile(np.eye(4), (len(names), 1, 1))
     matrices[:, :3] = poses
     matrices[inexact, :3, :3] = left @ right
-    return tuple(
+    views = tuple(
         View(name, name, Camera(int(size[0]), int(size[1]), *lens.tolist(), matrix))  # type: ignore[call-arg]
         for name, size, lens, matrix in zip(names, sizes, intrinsics, matrices, strict=True)
     )
-
-
-def cameras_of(
-    names: Sequence[str], optics: Sequence[Optics], world_to_camera: NDArray[np.float64]
-) -> tuple[tuple[View, ...], tuple[Lens, ...]]:
-    """(views, lenses) of cameras, checked as by `make_views`."""
-    numbers = np.array([values for values, _ in optics], np.float64).reshape(-1, 6)
-    views = make_views(names, numbers[:, :2], numbers[:, 2:], world_to_camera)
-    return views, tuple(lens for _, lens in optics)
+    return CameraFile(views, folder, tuple(lens for _, lens in optics), georeference)
 
 
 def poses_of(rotations: NDArray[np.float64], centres: NDArray[np.float64]) -> NDArray[np.float64]:
     """[V, 3, 4] world to camera, from its rotations [V, 3, 3] and the cameras' centres [V, 3]."""
-    with np.errstate(all="ignore"):  # `make_views` checks the result
+    with np.errstate(all="ignore"):  # `camera_file` checks the result
         translations = -np.einsum("vij,vj->vi", rotations, centres)
     return np.concatenate([rotations, translations[:, :, None]], axis=2)
 
@@ -203,6 +203,12 @@ def size_of_picture(folder: Path, name: str) -> tuple[int, int]:
         if (near / name).is_file():
             return stored_size(near / name)
     raise BadFileError(f"{name[:80]} is not found, and its size is needed")
+
+
+def picture_beside(path: Path) -> Path | None:
+    """The picture of the same name as a camera file; None if there is none."""
+    near = (path.with_suffix(suffix) for name in _SUFFIXES for suffix in (name, name.upper()))
+    return next((picture for picture in near if picture.is_file()), None)
 
 
 def stored_size(path: Path) -> tuple[int, int]:

@@ -7,8 +7,10 @@ the same as ours, and the world is not transformed.
 
 from __future__ import annotations
 
+import itertools
 import struct
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +19,7 @@ from numpy.typing import NDArray
 from stages.base.atomic import replacing
 from stages.base.bad_files import CAMERAS, BadFileError, reading
 from stages.cameras import colmap_records as records
-from stages.cameras.camera_file import CameraFile, FilePoints, cameras_of
+from stages.cameras.camera_file import NO_POINTS, CameraFile, FilePoints, camera_file
 from stages.cameras.colmap_records import POINT2D, ImageRecord
 from stages.scene import Camera
 from stages.scene.rotations import matrices_of, quaternions_of
@@ -26,34 +28,38 @@ _PINHOLE = 1
 
 
 @dataclass(frozen=True)
-class ColmapModel:
-    """Pinhole views, and points or none. Ids in the files that we write are positions + 1.
+class Observations:
+    """points [O], views [O], px [O, 2]: which point each view observes at which pixel of its
+    undistorted picture; sorted by point, then view."""
+
+    points: NDArray[np.int32]
+    views: NDArray[np.int32]
+    px: NDArray[np.float64]
+
+
+NO_OBSERVATIONS = Observations(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 2)))
+
+
+def write_model(
+    folder: Path,
+    names: Sequence[str],
+    cameras: Sequence[Camera],
+    cloud: FilePoints = NO_POINTS,
+    observations: Observations = NO_OBSERVATIONS,
+) -> None:
+    """Write the three files into `folder`, which is created. Ids are positions + 1.
 
     Args:
+        folder: for the files.
         names: V picture paths, relative to the folder of pictures.
         cameras: of the V views; views with equal intrinsics share one camera in the file.
-        points: [P, 3].
-        colours: [P, 3] uint8.
-        errors_px: [P] reprojection errors.
-        observed_points: [O] the point of each observation; sorted by point, then view.
-        observing_views: [O] the view of each observation.
-        observed_px: [O, 2] where that view observes the point.
+        cloud: points.
+        observations: of these points.
+
+    Raises SplatError if they cannot be written.
     """
-
-    names: tuple[str, ...]
-    cameras: tuple[Camera, ...]
-    points: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
-    colours: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))
-    errors_px: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
-    observed_points: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
-    observing_views: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
-    observed_px: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
-
-
-def write_colmap_model(folder: Path, model: ColmapModel) -> None:
-    """Write the three files into `folder`, which is created. Raises SplatError if it cannot be."""
     folder.mkdir(parents=True, exist_ok=True)
-    intrinsics = [_intrinsics(camera) for camera in model.cameras]
+    intrinsics = [_intrinsics(camera) for camera in cameras]
     distinct = sorted(set(intrinsics), key=intrinsics.index)
     camera_ids = {values: number for number, values in enumerate(distinct, 1)}
     with replacing(folder / "cameras.bin") as path, path.open("wb") as file:
@@ -61,14 +67,14 @@ def write_colmap_model(folder: Path, model: ColmapModel) -> None:
         for (width, height, *params), number in camera_ids.items():
             file.write(struct.pack("<IiQQ4d", number, _PINHOLE, width, height, *params))
     # by_view lists observations view by view; rank is an observation's number within its view.
-    by_view = np.argsort(model.observing_views, kind="stable")
-    counts = np.bincount(model.observing_views, minlength=len(model.names))
+    by_view = np.argsort(observations.views, kind="stable")
+    counts = np.bincount(observations.views, minlength=len(names))
     starts = np.concatenate([[0], np.cumsum(counts)])
     rank = np.empty(len(by_view), np.int64)
     rank[by_view] = np.arange(len(by_view)) - np.repeat(starts[:-1], counts)
     with replacing(folder / "images.bin") as path, path.open("wb") as file:
-        file.write(struct.pack("<Q", len(model.names)))
-        for view, (name, camera) in enumerate(zip(model.names, model.cameras, strict=True)):
+        file.write(struct.pack("<Q", len(names)))
+        for view, (name, camera) in enumerate(zip(names, cameras, strict=True)):
             pose = (
                 *quaternions_of(camera.world_to_camera[:3, :3]),
                 *camera.world_to_camera[:3, 3],
@@ -77,22 +83,21 @@ def write_colmap_model(folder: Path, model: ColmapModel) -> None:
             file.write(name.encode() + b"\0")
             rows = by_view[starts[view] : starts[view + 1]]
             points2d = np.empty(len(rows), POINT2D)
-            points2d["xy"] = model.observed_px[rows]
-            points2d["point"] = model.observed_points[rows] + 1
+            points2d["xy"] = observations.px[rows]
+            points2d["point"] = observations.points[rows] + 1
             file.write(struct.pack("<Q", len(rows)) + points2d.tobytes())
-    _write_points(folder / "points3D.bin", model, rank)
+    elements = np.stack([observations.views + 1, rank], axis=1).astype("<u4")
+    starts = np.searchsorted(observations.points, np.arange(len(cloud.points) + 1))
+    tracks = [elements[start:end] for start, end in itertools.pairwise(starts)]
+    _write_points(folder / "points3D.bin", cloud, tracks)
 
 
-def _write_points(target: Path, model: ColmapModel, rank: NDArray[np.int64]) -> None:
-    starts = np.searchsorted(model.observed_points, np.arange(len(model.points) + 1))
-    elements = np.stack([model.observing_views + 1, rank], axis=1).astype("<u4")
+def _write_points(target: Path, cloud: FilePoints, tracks: list[NDArray[np.uint32]]) -> None:
     with replacing(target) as path, path.open("wb") as file:
-        file.write(struct.pack("<Q", len(model.points)))
-        for point, (xyz, rgb, error) in enumerate(
-            zip(model.points, model.colours, model.errors_px, strict=True)
-        ):
-            track = elements[starts[point] : starts[point + 1]]
-            file.write(struct.pack("<Q3d3BdQ", point + 1, *xyz, *rgb, error, len(track)))
+        file.write(struct.pack("<Q", len(cloud.points)))
+        rows = zip(cloud.points, cloud.colours, cloud.errors_px, tracks, strict=True)
+        for number, (xyz, rgb, error, track) in enumerate(rows, 1):
+            file.write(struct.pack("<Q3d3BdQ", number, *xyz, *rgb, error, len(track)))
             file.write(track.tobytes())
 
 
@@ -114,9 +119,11 @@ def read(folder: Path) -> CameraFile:
     return _read(folder)[0]
 
 
-def read_model(folder: Path) -> tuple[CameraFile, ColmapModel]:
-    """Cameras and points; keypoints without a 3D point are left out. Raises SplatError
-    "cameras-unreadable"."""
+def read_model(folder: Path) -> tuple[CameraFile, FilePoints, Observations]:
+    """Cameras, points and observations; keypoints without a 3D point are left out.
+
+    Raises SplatError "cameras-unreadable".
+    """
     found, images = _read(folder)
     path, text = _part(folder, "points3D")
     with reading(path, CAMERAS):
@@ -134,16 +141,10 @@ def read_model(folder: Path) -> tuple[CameraFile, ColmapModel]:
         known = np.isin(seen["point"], ids)
         points = order[place[known]].astype(np.int32)
         sort = np.lexsort((views[known], points))
-        return found, ColmapModel(
-            names=tuple(view.name for view in found.views),
-            cameras=tuple(view.camera for view in found.views),
-            points=rows[:, 1:4],
-            colours=rows[:, 4:7].astype(np.uint8),
-            errors_px=rows[:, 7],
-            observed_points=points[sort],
-            observing_views=views[known][sort].astype(np.int32),
-            observed_px=seen["xy"][known][sort],
-        )
+        tracks = np.bincount(points, minlength=len(rows)).astype(np.int32)
+        cloud = FilePoints(rows[:, 1:4], rows[:, 4:7].astype(np.uint8), rows[:, 7], tracks)
+        observing = views[known][sort].astype(np.int32)
+        return found, cloud, Observations(points[sort], observing, seen["xy"][known][sort])
 
 
 def read_points(folder: Path) -> FilePoints | None:
@@ -152,9 +153,7 @@ def read_points(folder: Path) -> FilePoints | None:
     path, text = _part(folder, "points3D")
     if not path.is_file() or (text and not path.stat().st_size):
         return None
-    model = read_model(folder)[1]
-    tracks = np.bincount(model.observed_points, minlength=len(model.points)).astype(np.int32)
-    return FilePoints(model.points, model.colours, model.errors_px, tracks)
+    return read_model(folder)[1]
 
 
 def _part(folder: Path, name: str) -> tuple[Path, bool]:
@@ -175,11 +174,11 @@ def _read(folder: Path) -> tuple[CameraFile, list[ImageRecord]]:
         if missing:
             raise BadFileError(f"there is no camera {min(missing)}")
         poses = np.array([image.pose for image in images], np.float64).reshape(-1, 7)
-        with np.errstate(invalid="ignore"):  # `cameras_of` rejects a quaternion of length 0
+        with np.errstate(invalid="ignore"):  # `camera_file` rejects a quaternion of length 0
             rotations = matrices_of(poses[:, :4])
         own = [optics[image.camera] for image in images]
         matrices = np.concatenate([rotations, poses[:, 4:, None]], axis=2)
-        views, lenses = cameras_of([image.name for image in images], own, matrices)
-    near = [base / "images" for base in (folder, folder.parent, folder.parent.parent)]
-    pictures = next((path for path in near if path.is_dir()), near[0])
-    return CameraFile(views, pictures, lenses), images
+        near = [base / "images" for base in (folder, folder.parent, folder.parent.parent)]
+        pictures = next((path for path in near if path.is_dir()), near[0])
+        names = [image.name for image in images]
+        return camera_file(pictures, names, own, matrices), images

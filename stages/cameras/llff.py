@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from stages.base.bad_files import CAMERAS, BadFileError, reading
 from stages.base.text import reason_of
-from stages.cameras.camera_file import CameraFile, content_of, make_views, poses_of
+from stages.cameras.camera_file import CameraFile, camera_file, content_of, poses_of
 from stages.cameras.lens import PINHOLE
 
 _NAME = "poses_bounds.npy"
@@ -40,11 +40,11 @@ def read(path: Path) -> CameraFile:
         matrices = rows[:, :15].reshape(-1, 3, 5)
         down, right, backward, centre, camera = np.moveaxis(matrices, 2, 0)
         rotations = np.stack([right, down, -backward], axis=1)
-        height, width, focal = camera.T
-        lens = np.stack([focal, focal, width / 2, height / 2], axis=1)
-        sizes = np.stack([width, height], axis=1)
-        views = make_views(names, sizes, lens, poses_of(rotations, centre))
-        return CameraFile(views, path.parent, (PINHOLE,) * len(views))
+        optics = [
+            ((width, height, focal, focal, width / 2, height / 2), PINHOLE)
+            for height, width, focal in camera.tolist()
+        ]
+        return camera_file(path.parent, names, optics, poses_of(rotations, centre))
 
 
 def _rows(data: bytes) -> NDArray[np.float64]:

@@ -22,7 +22,7 @@ from stages.cameras.camera_file import (
     ROTATION_TOLERANCE,
     CameraFile,
     Georeference,
-    cameras_of,
+    camera_file,
     poses_of,
 )
 from stages.cameras.lens import Lens
@@ -52,8 +52,8 @@ def read(path: Path) -> CameraFile:
         poses = np.array(texts, np.float64).reshape(-1, 4, 4)
         rotations = poses[:, :3, :3].transpose(0, 2, 1)
         names = [camera.get("label", "") for camera in aligned]
-        views, lenses = cameras_of(names, mine, poses_of(rotations, poses[:, :3, 3]))
-        return CameraFile(views, path.parent, lenses, _georeference(root))
+        moved = poses_of(rotations, poses[:, :3, 3])
+        return camera_file(path.parent, names, mine, moved, _georeference(root))
 
 
 def _georeference(root: Element) -> Georeference:

@@ -28,10 +28,10 @@ from stages.base.bad_files import CAMERAS, BadFileError, reading
 from stages.cameras.camera_file import (
     CameraFile,
     FilePoints,
+    camera_file,
     check_inside,
     content_of,
     file_points,
-    make_views,
     poses_of,
     stored_size,
 )
@@ -100,19 +100,16 @@ def read(path: Path, size: tuple[int, int] | None = None) -> CameraFile:
         frames = data["frames"]
         if not all(isinstance(frame, dict) for frame in frames):
             raise BadFileError("a frame is not an object")
-        numbers = np.array(
-            [_read_numbers(ChainMap(frame, data), path.parent, size) for frame in frames],
-            np.float64,
-        ).reshape(-1, 6)
-        if not np.isfinite(numbers).all():
+        merged = [ChainMap(frame, data) for frame in frames]
+        optics = [(_read_numbers(one, path.parent, size), _read_lens(one)) for one in merged]
+        if not np.isfinite([numbers for numbers, _ in optics]).all():
             raise BadFileError("a size or focal length is not a number")
         saved = np.zeros((len(frames), 3, 4))
         for row, frame in zip(saved, frames, strict=True):
-            row[:] = np.array(_required(frame, "transform_matrix"), np.float64)[:3]
-        names = [str(_required(frame, "file_path")) for frame in frames]
-        views = make_views(names, numbers[:, :2], numbers[:, 2:], _our_poses(data, saved))
-        lenses = tuple(_read_lens(ChainMap(frame, data)) for frame in frames)
-        return CameraFile(_with_roles(views, data), path.parent, lenses)
+            row[:] = np.array(required(frame, "transform_matrix"), np.float64)[:3]
+        names = [str(required(frame, "file_path")) for frame in frames]
+        found = camera_file(path.parent, names, optics, _our_poses(data, saved))
+        return replace(found, views=_with_roles(found.views, data))
 
 
 def read_points(path: Path) -> FilePoints | None:
@@ -142,7 +139,7 @@ def depth_maps(path: Path) -> tuple[dict[str, Path], float]:
         for frame in data["frames"]:
             if named := str(frame.get("depth_file_path") or ""):
                 check_inside(path.parent, named, path.parent)
-                found[str(_required(frame, "file_path"))] = path.parent / named
+                found[str(required(frame, "file_path"))] = path.parent / named
         return found, unit
 
 
@@ -170,7 +167,7 @@ def _saved_pose(world_to_camera: NDArray[np.float64]) -> NDArray[np.float64]:
 def _our_poses(data: dict[str, Any], saved: NDArray[np.float64]) -> NDArray[np.float64]:
     """[V, 3, 4] world to camera of OpenGL camera-to-world matrices [V, 3, 4]."""
     turn, shift, scale = _applied(data)
-    with np.errstate(over="ignore", invalid="ignore"):  # `make_views` checks the result
+    with np.errstate(over="ignore", invalid="ignore"):  # `camera_file` checks the result
         centres = (saved[:, :, 3] / scale - shift) @ turn
         rotations = OPENGL_FROM_OURS @ saved[:, :, :3].transpose(0, 2, 1) @ turn
     return poses_of(rotations, centres)
@@ -204,7 +201,7 @@ def _read_numbers(
     if "w" in merged and "h" in merged:
         width, height = float(merged["w"]), float(merged["h"])
     else:
-        width, height = _picture_size(folder, str(_required(merged, "file_path")), size)
+        width, height = _picture_size(folder, str(required(merged, "file_path")), size)
     fx = _focal(merged, "x", width, None)
     return [
         width,
@@ -224,7 +221,7 @@ def _focal(merged: Mapping[str, Any], axis: str, side: float, otherwise: float |
         return 0.5 * side / math.tan(0.5 * angle) if 0 < angle < math.pi else math.nan
     if otherwise is not None and f"fl_{axis}" not in merged:
         return otherwise
-    return float(_required(merged, f"fl_{axis}"))
+    return float(required(merged, f"fl_{axis}"))
 
 
 def _picture_size(folder: Path, name: str, otherwise: tuple[int, int] | None) -> tuple[int, int]:
@@ -250,7 +247,8 @@ def _read_lens(merged: Mapping[str, Any]) -> Lens:
     return Lens("fisheye" if fisheye else "perspective", (k1, k2, k3, k4), tangential=(p1, p2))
 
 
-def _required(values: Mapping[str, Any], key: str) -> Any:
+def required(values: Mapping[str, Any], key: str) -> Any:
+    """A value of a frame. Raises BadFileError if it has none."""
     if key not in values:
         raise BadFileError(f"a frame has no {key}")
     return values[key]

@@ -17,13 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import CAMERAS, BadFileError, reading
-from stages.cameras.camera_file import (
-    CameraFile,
-    Georeference,
-    cameras_of,
-    json_of,
-    poses_of,
-)
+from stages.cameras.camera_file import CameraFile, Georeference, camera_file, json_of, poses_of
 from stages.cameras.lens import PINHOLE, Lens
 from stages.cameras.opensfm import optics_of, rotations_of
 from stages.scene.place import EarthPlace
@@ -31,7 +25,7 @@ from stages.scene.place import EarthPlace
 _NAME = "shots.geojson"
 _SOURCE = "the projection of shots.geojson"
 _AGREEING_M = 5.0
-_HALF_AXIS, _ECCENTRICITY2, _UTM_SCALE = 6_378_137.0, 6.69437999014e-3, 0.9996
+_HALF_AXIS, _FLATTENING, _UTM_SCALE = 6_378_137.0, 1 / 298.257223563, 0.9996
 
 
 def locate(path: Path) -> Path | None:
@@ -58,14 +52,13 @@ def read(path: Path) -> CameraFile:
         where = np.array([shot["geometry"]["coordinates"][:2] for shot in shots], np.float64)
         if not np.isfinite(where).all():
             raise BadFileError("a place is not two numbers")
-        with np.errstate(all="ignore"):  # `make_views` checks the result
+        with np.errstate(all="ignore"):  # `camera_file` checks the result; no zone fits bad places
             rotations = rotations_of(turns)
-        place = _place(where.reshape(-1, 2), centres)
+            place = _place(where.reshape(-1, 2), centres)
         poses = poses_of(rotations, centres - place.offset if place else centres)
-        views, shot_lenses = cameras_of(names, optics, poses)
         georeference = Georeference(1.0, np.eye(3), _SOURCE, place)
         root = path.parent.parent if path.parent.name == "odm_report" else path.parent
-        return CameraFile(views, root / "images", shot_lenses, georeference)
+        return camera_file(root / "images", names, optics, poses, georeference)
 
 
 def files(path: Path) -> list[Path]:
@@ -117,29 +110,23 @@ def _place(where: NDArray[np.float64], centres: NDArray[np.float64]) -> EarthPla
 def utm(where: NDArray[np.float64], zone: int, south: bool) -> NDArray[np.float64]:
     """[N, 2] easting and northing of longitudes and latitudes [N, 2], degrees, on WGS 84.
 
-    By the series of Snyder (Map Projections, USGS 1987, equations 8-9 to 8-15, 3-21), good to a
-    millimetre within 3 degrees of the zone's middle: to recognise a zone.
+    By the series of Krueger to the third power of the flattening (Karney, Transverse Mercator with
+    an accuracy of a few nanometers, 2011, equations 7 to 14 and 35), good to a millimetre: to
+    recognise a zone.
     """
-    phi = np.radians(where[:, 1])
-    e2 = _ECCENTRICITY2
-    minor = e2 / (1 - e2)
-    across = np.radians((where[:, 0] - (6 * zone - 183) + 180) % 360 - 180) * np.cos(phi)
-    t, c = np.tan(phi) ** 2, minor * np.cos(phi) ** 2
-    radius = _HALF_AXIS / np.sqrt(1 - e2 * np.sin(phi) ** 2)
-    arc = _HALF_AXIS * (
-        (1 - e2 / 4 - 3 * e2**2 / 64 - 5 * e2**3 / 256) * phi
-        - (3 * e2 / 8 + 3 * e2**2 / 32 + 45 * e2**3 / 1024) * np.sin(2 * phi)
-        + (15 * e2**2 / 256 + 45 * e2**3 / 1024) * np.sin(4 * phi)
-        - 35 * e2**3 / 3072 * np.sin(6 * phi)
+    n = _FLATTENING / (2 - _FLATTENING)
+    eccentricity = 2 * np.sqrt(n) / (1 + n)
+    sine = np.sin(np.radians(where[:, 1]))
+    across = np.radians((where[:, 0] - (6 * zone - 183) + 180) % 360 - 180)
+    tangent = np.sinh(np.arctanh(sine) - eccentricity * np.arctanh(eccentricity * sine))
+    sphere = np.arctan2(tangent, np.cos(across)) + 1j * np.arctanh(
+        np.sin(across) / np.hypot(1, tangent)
     )
-    fifth = 5 - 18 * t + t**2 + 72 * c - 58 * minor
-    sixth = 61 - 58 * t + t**2 + 600 * c - 330 * minor
-    east = across + (1 - t + c) * across**3 / 6 + fifth * across**5 / 120
-    north = across**2 / 2 + (5 - t + 9 * c + 4 * c**2) * across**4 / 24 + sixth * across**6 / 720
-    return np.stack(
-        [
-            500_000 + _UTM_SCALE * radius * east,
-            (10_000_000 if south else 0) + _UTM_SCALE * (arc + radius * np.tan(phi) * north),
-        ],
-        axis=1,
+    factors = (
+        n / 2 - 2 / 3 * n**2 + 5 / 16 * n**3,
+        13 / 48 * n**2 - 3 / 5 * n**3,
+        61 / 240 * n**3,
     )
+    plane = sphere + sum(f * np.sin(2 * k * sphere) for k, f in enumerate(factors, 1))
+    plane *= _UTM_SCALE * _HALF_AXIS / (1 + n) * (1 + n**2 / 4 + n**4 / 64)
+    return np.stack([500_000 + plane.imag, (10_000_000 if south else 0) + plane.real], axis=1)

@@ -9,6 +9,7 @@ metres east, north and up of it, as far as GPS is right; without GPS the referen
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from stages.cameras.camera_file import (
     CameraFile,
     FilePoints,
     Georeference,
-    cameras_of,
+    camera_file,
     file_points,
     json_of,
 )
@@ -60,12 +61,12 @@ def read(path: Path) -> CameraFile:
             raise BadFileError(f"there is no camera {min(missing)[:80]!r}")
         turns = np.array([shot["rotation"] for shot in shots.values()], np.float64).reshape(-1, 3)
         shifts = np.array([shot["translation"] for shot in shots.values()], np.float64)
-        with np.errstate(all="ignore"):  # `make_views` checks the result
+        with np.errstate(all="ignore"):  # `camera_file` checks the result
             rotations = rotations_of(turns)
         poses = np.concatenate([rotations, shifts.reshape(-1, 3, 1)], axis=2)
         own = [optics[shot["camera"]] for shot in shots.values()]
-        views, lenses = cameras_of(list(shots), own, poses)
-        return CameraFile(views, path.parent / "images", lenses, _georeference(data, views))
+        found = camera_file(path.parent / "images", list(shots), own, poses)
+        return replace(found, georeference=_georeference(data, found.views))
 
 
 def _georeference(data: Mapping[str, Any], views: tuple[View, ...]) -> Georeference:

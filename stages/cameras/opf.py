@@ -23,7 +23,7 @@ from stages.cameras.camera_file import (
     NO_GEOREFERENCE,
     CameraFile,
     Georeference,
-    cameras_of,
+    camera_file,
     check_inside,
     json_of,
     poses_of,
@@ -74,10 +74,9 @@ def read(path: Path) -> CameraFile:
         angles = np.array([camera["orientation_deg"] for camera in cameras], np.float64)
         centres = np.array([camera["position"] for camera in cameras], np.float64).reshape(-1, 3)
         poses = poses_of(_world_to_camera(angles.reshape(-1, 3)), centres)
-        views, lenses = cameras_of(names, mine, poses)
         frames = list(_parts(path, project, "scene_reference_frame"))
         ground = _georeference(frames[0]) if len(frames) == 1 else NO_GEOREFERENCE
-        return CameraFile(views, path.parent, lenses, ground)
+        return camera_file(path.parent, names, mine, poses, ground)
 
 
 def files(path: Path) -> list[Path]:

@@ -17,12 +17,19 @@ from numpy.typing import NDArray
 
 from stages.base.bad_files import CAMERAS, BadFileError, reading
 from stages.base.text import reason_of
-from stages.cameras.camera_file import CameraFile, content_of, make_views, poses_of, size_of_picture
+from stages.cameras.camera_file import (
+    CameraFile,
+    Optics,
+    camera_file,
+    content_of,
+    poses_of,
+    size_of_picture,
+)
 from stages.cameras.lens import Lens
 from stages.cameras.nerfstudio import OPENGL_FROM_OURS
 
 _LONGER_SIDE = 36.0  # in the file's own unit
-_NEEDED = ("x", "y", "alt", "heading", "pitch", "roll", "f")
+_PLACE = ("x", "y", "alt", "heading", "pitch", "roll")
 _OPTIONAL = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
 
 
@@ -32,21 +39,12 @@ def read(path: Path) -> CameraFile:
     with reading(path, CAMERAS):
         rows = _rows(path)
         names = [row["name"] for row in rows]
-        found = np.array([[float(row[key]) for key in _NEEDED] for row in rows], np.float64)
-        lens = np.array([[float(row.get(key) or 0) for key in _OPTIONAL] for row in rows])
-        if not (np.isfinite(found).all() and np.isfinite(lens).all()):
+        placed = np.array([[float(row[key]) for key in _PLACE] for row in rows], np.float64)
+        if not np.isfinite(placed).all():
             raise BadFileError("it holds a value that is not a number")
-        sizes = np.array([size_of_picture(path.parent, name) for name in names], np.float64)
-        scale = sizes.max(axis=1, keepdims=True) / _LONGER_SIDE
-        centres = sizes / 2 + lens[:, :2] * scale
-        focal = found[:, 6:] * scale
-        poses = poses_of(_world_to_camera(found[:, 3:6]), found[:, :3])
-        views = make_views(names, sizes, np.hstack([focal, focal, centres]), poses)
-        lenses = tuple(
-            Lens(radial=tuple(row[2:6].tolist()), tangential=(float(row[6]), float(row[7])))
-            for row in lens
-        )
-        return CameraFile(views, path.parent, lenses)
+        optics = [_optics(row, *size_of_picture(path.parent, row["name"])) for row in rows]
+        poses = poses_of(_world_to_camera(placed[:, 3:]), placed[:, :3])
+        return camera_file(path.parent, names, optics, poses)
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
@@ -55,7 +53,7 @@ def _rows(path: Path) -> list[dict[str, str]]:
     try:
         columns = [column.strip().lstrip("#").lower() for column in reader.fieldnames or ()]
         reader.fieldnames = columns
-        missing = [key for key in ("name", *_NEEDED) if key not in columns]
+        missing = [key for key in ("name", *_PLACE, "f") if key not in columns]
         if missing:
             raise BadFileError(f"it has no column {missing[0]!r}")
         rows = [row for row in reader if row["name"]]
@@ -66,6 +64,16 @@ def _rows(path: Path) -> list[dict[str, str]]:
     if not rows:
         raise BadFileError("it holds no camera")
     return rows
+
+
+def _optics(row: dict[str, str], width: int, height: int) -> Optics:
+    scale = max(width, height) / _LONGER_SIDE
+    focal = float(row["f"]) * scale
+    px, py, k1, k2, k3, k4, t1, t2 = (float(row.get(key) or 0) for key in _OPTIONAL)
+    centre = width / 2 + px * scale, height / 2 + py * scale
+    return (width, height, focal, focal, *centre), Lens(
+        radial=(k1, k2, k3, k4), tangential=(t1, t2)
+    )
 
 
 def _world_to_camera(angles: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -15,13 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import CAMERAS, BadFileError, reading
-from stages.cameras.camera_file import CameraFile, cameras_of, poses_of, stored_size
+from stages.cameras.camera_file import (
+    CameraFile,
+    camera_file,
+    picture_beside,
+    poses_of,
+    stored_size,
+)
 from stages.cameras.lens import PINHOLE, Lens
 from stages.cameras.xml_file import parsed
 
 _LONGER_SIDE = 36.0
 _NAMESPACE = "{http://www.capturingreality.com/ns/xcr/1.1#}"
-_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".heic")
 _START = 4096  # bytes in which the namespace of RealityScan is declared
 
 
@@ -48,13 +53,14 @@ def read(path: Path) -> CameraFile:
                 continue  # not registered: it has a calibration only
             if len(rotation) != 9 or len(position) != 3:
                 raise BadFileError("its pose is not 9 and 3 numbers")
-            picture = _picture(file)
+            picture = picture_beside(file)
+            if picture is None:
+                raise BadFileError("its picture is not beside it, and the size of that is needed")
             names.append(picture.name)
             optics.append((_intrinsics(about, *stored_size(picture)), _lens(about)))
             poses.append(poses_of(rotation.reshape(1, 3, 3), position.reshape(1, 3))[0])
     with reading(next(iter(sorted(path.glob("*.xmp")))), CAMERAS):
-        views, lenses = cameras_of(names, optics, np.array(poses).reshape(-1, 3, 4))
-        return CameraFile(views, path, lenses)
+        return camera_file(path, names, optics, np.array(poses).reshape(-1, 3, 4))
 
 
 def _description(path: Path) -> Element:
@@ -72,14 +78,6 @@ def _text(about: Element, name: str) -> str | None:
 def _values(about: Element, name: str) -> NDArray[np.float64] | None:
     text = _text(about, name)
     return None if text is None else np.array(text.split(), np.float64)
-
-
-def _picture(path: Path) -> Path:
-    for suffix in _SUFFIXES:
-        for near in (path.with_suffix(suffix), path.with_suffix(suffix.upper())):
-            if near.is_file():
-                return near
-    raise BadFileError("its picture is not beside it, and the size of that is needed")
 
 
 def _intrinsics(about: Element, width: int, height: int) -> list[float]:

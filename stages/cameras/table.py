@@ -4,7 +4,7 @@ To add one:
 
 1. Write a module here with `locate(path)`, which returns the path to read, or None if `path` is not
    such a file. A format that its suffix identifies needs none: its row names the suffix.
-2. Give it `read(path)`, which returns a `CameraFile` made by `camera_file.make_views`.
+2. Give it `read(path)`, which returns a `CameraFile` made by `camera_file.camera_file`.
 3. Give it `read_points(path)` if the file has sparse points, and `files(path)` if other files than
    the .ply beside it, or those of the folder, are read with it.
 4. Add a row to `CAMERA_FILES`; the first format that locates a file reads it.

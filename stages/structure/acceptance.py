@@ -27,7 +27,7 @@ def accepted_model(
     """The model of the best attempt. Raises SplatError if it failed a gate, unless `allow_partial`
     and the model has enough photographs and points. features: the setting."""
     best = best_attempt(attempts)
-    model = best.result.model if best.result is not None else None
+    model = best.result.model
     if model is not None and len(model.names) >= THRESHOLDS.fewest_views:
         enough = len(model.points) >= _FEWEST_PARTIAL_POINTS
         if best.passed or (enough and allow_partial):
@@ -35,12 +35,11 @@ def accepted_model(
     if best.configuration.learned and attempts[0].failures[0].code == "sfm-too-few-features":
         best = attempts[0]  # the photographs show nothing, and the gates after that do not say so
     worst = with_hint(best.failures[0], features)
-    groups = best.result.groups if best.result is not None else ()
-    if worst.code == "sfm-too-few-registered" and len(groups) > 1:
+    if worst.code == "sfm-too-few-registered" and len(best.result.groups) > 1:
         names = {photo.image: photo.source for photo in capture.photos}
         described = "; ".join(
             f"{len(group)} ({listed(sorted(names[image] for image in group), 3)})"
-            for group in groups[:4]
+            for group in best.result.groups[:4]
         )
         given = f"{worst.given} The largest models are of: {described}."
         raise failure("sfm-separate-groups", given, worst.wanted, worst.hint)
@@ -48,13 +47,15 @@ def accepted_model(
 
 
 def report_warnings(
-    attempts: list[Attempt], capture: Capture, report: Report, features: str = "sift"
+    attempts: list[Attempt],
+    model: SparseModel,
+    capture: Capture,
+    report: Report,
+    features: str = "sift",
 ) -> None:
-    """Warnings about the model of the best attempt. features: the setting."""
+    """Warnings about the `model` of the best attempt. features: the setting."""
     best = best_attempt(attempts)
-    assert best.result is not None
-    assert best.result.model is not None
-    registered = set(best.result.model.names)
+    registered = set(model.names)
     lost = (photo.source for photo in capture.photos if photo.image not in registered)
     missing = list(dict.fromkeys(lost))
     if missing:
@@ -87,18 +88,16 @@ def report_warnings(
         )
 
 
-def report_joined(attempts: list[Attempt], capture: Capture, report: Report) -> None:
-    """The metric `registered_by`: how many photographs of the used model SIFT registered, and the
+def report_joined(
+    attempts: list[Attempt], model: SparseModel, capture: Capture, report: Report
+) -> None:
+    """The metric `registered_by`: how many photographs of the used `model` SIFT registered, and the
     names of those that learned features joined."""
-    best = best_attempt(attempts)
-    assert best.result is not None
-    assert best.result.model is not None
-    used = set(best.result.model.names)
+    used = set(model.names)
     joined: set[str] = set()
-    if best.configuration.learned:
-        by_sift = (a for a in attempts if not a.configuration.learned and a.result is not None)
-        models = (attempt.result.model for attempt in by_sift if attempt.result is not None)
-        joined = used - {name for model in models if model is not None for name in model.names}
+    if best_attempt(attempts).configuration.learned:
+        others = (attempt.result.model for attempt in attempts if not attempt.configuration.learned)
+        joined = used - {name for other in others if other is not None for name in other.names}
     names = [photo.name for photo in capture.photos if photo.image in joined]
     report.metric("registered_by", {"sift": len(used) - len(names), "learned": names})
 

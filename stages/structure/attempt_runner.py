@@ -137,7 +137,6 @@ class AttemptRunner:
             base,
             database=str(self.folder / ("more.db" if more else "base.db")),
             out=str(self.folder / model_folder),
-            progress=str(self.folder / "progress.json"),
             max_features=round(base.max_features * (MORE_FEATURES if more else 1)),
             peak_threshold=base.peak_threshold * (LOWER_PEAK if more else 1.0),
             matching="exhaustive" if more else base.matching,

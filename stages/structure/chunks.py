@@ -98,7 +98,6 @@ def run_chunk(chunk: Chunk) -> None:
         step="features chunk" if chunk.photographs else "matching chunk",
         source=job.database,
         database=str(folder / "chunk.db"),
-        progress=str(folder / "progress.json"),
         threads=threads.count(),
         photographs=chunk.photographs,
         pairs=chunk.pairs,

@@ -22,29 +22,24 @@ _KEYPOINT = 4  # numbers per keypoint, see `features.sift_features`
 def keypoint_counts(database: Path, photographs: int) -> list[int]:
     """[photographs] number of keypoints of each, by position in the capture (image id - 1)."""
     counts = [0] * photographs
-    with closing(_open_read_only(database)) as connection:
-        for image_id, rows in connection.execute("SELECT image_id, rows FROM keypoints"):
-            if 1 <= image_id <= photographs:
-                counts[image_id - 1] = int(rows)
+    for image_id, rows in _selected(database, "image_id, rows FROM keypoints"):
+        if 1 <= image_id <= photographs:
+            counts[image_id - 1] = int(rows)
     return counts
 
 
 def photographs_with_features(database: Path) -> set[int]:
     """Positions of photographs whose features are in the database."""
-    with closing(_open_read_only(database)) as connection:
-        return {
-            image_id - 1 for (image_id,) in connection.execute("SELECT image_id FROM descriptors")
-        }
+    return {image_id - 1 for (image_id,) in _selected(database, "image_id FROM descriptors")}
 
 
 def inliers_of_pairs(database: Path) -> dict[tuple[int, int], int]:
     """Inliers by (first, second) position, of every pair that was matched and verified."""
-    query = "SELECT pair_id, rows FROM two_view_geometries"
-    with closing(_open_read_only(database)) as connection:
-        return {
-            (pair_id // _MAX_IMAGES - 1, pair_id % _MAX_IMAGES - 1): int(rows)
-            for pair_id, rows in connection.execute(query)
-        }
+    pairs = _selected(database, "pair_id, rows FROM two_view_geometries")
+    return {
+        (pair_id // _MAX_IMAGES - 1, pair_id % _MAX_IMAGES - 1): int(rows)
+        for pair_id, rows in pairs
+    }
 
 
 def verified_pairs(database: Path) -> list[tuple[int, int, int, int]]:
@@ -53,12 +48,11 @@ def verified_pairs(database: Path) -> list[tuple[int, int, int, int]]:
     configuration: COLMAP's TwoViewGeometry: 2 calibrated, 3 uncalibrated, 4 planar, 5 panoramic,
     6 planar or panoramic, 7 watermark, 8 multiple.
     """
-    query = "SELECT pair_id, rows, config FROM two_view_geometries WHERE rows > 0 ORDER BY pair_id"
-    with closing(_open_read_only(database)) as connection:
-        return [
-            (pair_id // _MAX_IMAGES - 1, pair_id % _MAX_IMAGES - 1, int(rows), int(config))
-            for pair_id, rows, config in connection.execute(query)
-        ]
+    what = "pair_id, rows, config FROM two_view_geometries WHERE rows > 0 ORDER BY pair_id"
+    return [
+        (pair_id // _MAX_IMAGES - 1, pair_id % _MAX_IMAGES - 1, int(rows), int(config))
+        for pair_id, rows, config in _selected(database, what)
+    ]
 
 
 def repair(database: Path) -> None:
@@ -127,18 +121,13 @@ class StoredFeatures:
         return None if row is None else row[0] or b""
 
 
-def take_cameras(database: Path, source: Path) -> None:
-    """Replace the cameras of `database` by those of `source`, which nothing writes to."""
-    with closing(_attached(database, source)) as connection, connection:
-        connection.execute("DELETE FROM cameras")
-        connection.execute("INSERT INTO cameras SELECT * FROM other.cameras")
-
-
 def merge_chunks(database: Path, chunks: Iterable[Path]) -> None:
     """Move features and matches from the databases of finished `chunks` into `database`; rows that
     it has already stay. Each chunk is deleted after its transaction."""
     for chunk in chunks:
-        with closing(_attached(database, chunk)) as connection, connection:
+        uri = database.absolute().as_uri()
+        with closing(sqlite3.connect(uri, uri=True, timeout=30.0)) as connection, connection:
+            connection.execute("ATTACH ? AS other", (f"{chunk.absolute().as_uri()}?immutable=1",))
             for table in ("keypoints", "descriptors", "matches", "two_view_geometries"):
                 connection.execute(f"INSERT OR IGNORE INTO {table} SELECT * FROM other.{table}")
         chunk.unlink()
@@ -167,11 +156,10 @@ def delete_geometries(database: Path) -> None:
         connection.commit()
 
 
-def _attached(database: Path, other: Path) -> sqlite3.Connection:
-    """A connection to `database`, with `other` attached read-only under the name "other"."""
-    connection = sqlite3.connect(database.absolute().as_uri(), uri=True, timeout=30.0)
-    connection.execute("ATTACH ? AS other", (f"{other.absolute().as_uri()}?immutable=1",))
-    return connection
+def _selected(database: Path, what: str) -> list[tuple[int, ...]]:
+    """The rows of a SELECT of integers."""
+    with closing(_open_read_only(database)) as connection:
+        return connection.execute(f"SELECT {what}").fetchall()
 
 
 def _open_read_only(

@@ -7,7 +7,7 @@ help: only other photographs fix a lack of parallax.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from stages.base.errors import SplatError
 from stages.structure.gates import ModelStatistics
@@ -68,7 +68,7 @@ class Attempt:
         configuration: what was run.
         failures: of its gates; empty if it passed.
         statistics: of the model found.
-        result: None if mapping was not reached.
+        result: of mapping; nothing if it was not reached.
         keypoints_median: per photograph.
         pairs_matched: pairs whose features were matched.
         pairs_verified: those of them with a two-view geometry.
@@ -77,7 +77,7 @@ class Attempt:
     configuration: Configuration
     failures: tuple[SplatError, ...]
     statistics: ModelStatistics
-    result: MappingResult | None = None
+    result: MappingResult = field(default_factory=MappingResult)
     keypoints_median: float = 0.0
     pairs_matched: int = 0
     pairs_verified: int = 0

@@ -50,7 +50,7 @@ def extract_chunk(job: Job) -> None:
 
 
 def _extract(job: Job, missing: list[int], have: int) -> None:
-    progress = ProgressWriter(Path(job.progress))
+    progress = ProgressWriter(job)
     cv2.setNumThreads(1)  # one thread per photograph is faster than several
     with pycolmap.Database.open(job.database) as database:
         for done, (position, (keypoints, descriptors)) in enumerate(_features(job, missing), 1):
@@ -65,7 +65,7 @@ def _features(job: Job, positions: list[int]) -> Iterator[tuple[int, Features]]:
     root = Path(job.images_root)
 
     def of_photograph(position: int) -> Features:
-        mask = job.masks[position] if job.masks else ""
+        mask = job.masks[position]
         picture = root / job.names[position]
         settings = job.max_features, job.peak_threshold
         return sift_features(picture, *settings, root / mask if mask else None)

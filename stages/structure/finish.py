@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stages.base.stage import Report
 from stages.cameras.camera_file import FilePoints
-from stages.cameras.colmap import ColmapModel, write_colmap_model
-from stages.cameras.lens import Lens
+from stages.cameras.colmap import Observations, write_model
 from stages.cameras.undistortion import SimpleRadial, undistorted_px
 from stages.scene import Camera, Capture, Photo, Reconstruction, View
 from stages.structure.gps import MetricScale
@@ -22,6 +20,7 @@ from stages.structure.metric_scale import UNKNOWN_SCALE, KnownScale, find_metric
 from stages.structure.sparse_model import SparseModel, point_errors
 from stages.structure.undistorted_images import (
     IMAGES,
+    PosedPhoto,
     depth_file,
     mask_file,
     write_undistorted_images,
@@ -29,19 +28,6 @@ from stages.structure.undistorted_images import (
 
 COLMAP = "colmap"
 SPARSE = f"{COLMAP}/sparse/0"
-
-
-@dataclass(frozen=True)
-class Observations:
-    """points [O], views [O], px [O, 2]: which point each view observes at which pixel of its
-    undistorted picture; sorted by point, then view."""
-
-    points: NDArray[np.int32]
-    views: NDArray[np.int32]
-    px: NDArray[np.float64]
-
-
-NO_OBSERVATIONS = Observations(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 2)))
 
 
 def finish(
@@ -60,8 +46,8 @@ def finish(
     model, levelled = level_and_recentre(model)
     by_image = {photo.image: photo for photo in capture.photos}
     photos = [by_image[name] for name in model.names]
-    taken, lenses = _cameras_and_lenses(model)
-    cameras, _ = write_undistorted_images(photos, taken, lenses, capture.folder, folder, report)
+    posed = _posed(photos, model)
+    cameras, _ = write_undistorted_images(posed, capture.folder, folder, report)
     pictures = [folder / IMAGES / photo.picture for photo in photos]
     scale = find_metric_scale(known_scale, photos, cameras, pictures, levelled, report)
     if scale is not None:
@@ -72,8 +58,9 @@ def finish(
     camera_of = model.view_cameras[model.observing_views]
     for number in np.unique(model.view_cameras):
         mine, view = camera_of == number, int(np.argmax(model.view_cameras == number))
+        taken = posed[view]
         observed_px[mine] = undistorted_px(
-            model.observed_px[mine], taken[view], lenses[view], cameras[view]
+            model.observed_px[mine], taken.camera, taken.lens, cameras[view]
         )
     return write_reconstruction(
         folder,
@@ -86,16 +73,16 @@ def finish(
     )
 
 
-def _cameras_and_lenses(model: SparseModel) -> tuple[list[Camera], list[Lens]]:
-    """Camera and lens of each view."""
-    cameras: list[Camera] = []
-    lenses: list[Lens] = []
-    for number, pose in zip(model.view_cameras, model.world_to_camera, strict=True):
+def _posed(photos: Sequence[Photo], model: SparseModel) -> list[PosedPhoto]:
+    """The photographs [V] with the model's cameras."""
+    posed = []
+    views = zip(photos, model.view_cameras, model.world_to_camera, strict=True)
+    for photo, number, pose in views:
         width, height = (int(side) for side in model.camera_sizes[number])
         focal, cx, cy, k = (float(value) for value in model.camera_params[number])
-        cameras.append(Camera(width, height, focal, focal, cx, cy, pose))
-        lenses.append(SimpleRadial(radial=(k,)))
-    return cameras, lenses
+        camera = Camera(width, height, focal, focal, cx, cy, pose)
+        posed.append(PosedPhoto(photo, camera, SimpleRadial(radial=(k,))))
+    return posed
 
 
 def write_reconstruction(
@@ -119,19 +106,8 @@ def write_reconstruction(
         levelled: whether up is -Y.
         metric: how the world became metric; None if it is not.
     """
-    write_colmap_model(
-        folder / SPARSE,
-        ColmapModel(
-            names=tuple(photo.picture for photo in photos),
-            cameras=tuple(cameras),
-            points=cloud.points,
-            colours=cloud.colours,
-            errors_px=cloud.errors_px,
-            observed_points=observations.points,
-            observing_views=observations.views,
-            observed_px=observations.px,
-        ),
-    )
+    names = [photo.picture for photo in photos]
+    write_model(folder / SPARSE, names, cameras, cloud, observations)
     views = tuple(
         View(
             photo.name,

@@ -6,7 +6,7 @@ that the others miss."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from statistics import median
 
@@ -175,8 +175,9 @@ def check_pairs(pairs: list[tuple[int, int, int, int]], photographs: int) -> lis
     return failures
 
 
-def connected_groups(pairs: list[tuple[int, int, int, int]], photographs: int) -> list[list[int]]:
-    """The connected components of the view graph, as sorted positions; largest first."""
+def connected_groups(pairs: Sequence[Sequence[int]], photographs: int) -> list[list[int]]:
+    """The connected components of the view graph, as sorted positions; largest first. pairs: begin
+    with two positions."""
     links = np.array([pair[:2] for pair in pairs], np.int64).reshape(-1, 2)
     graph = coo_array((np.ones(len(links)), tuple(links.T)), shape=(photographs, photographs))
     _, component = connected_components(graph, directed=False)

@@ -9,9 +9,9 @@ import json
 import os
 import shutil
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,13 +48,11 @@ class Job:
         images_root: folder that `names` and `masks` are relative to.
         database: COLMAP's database.
         out: folder for the model of mapping (`sparse_model.save_model`).
-        progress: file for the worker's progress (`ProgressWriter`).
         names: [P] in the capture's order, which fixes the image ids (position + 1).
         camera_of: [P] index into `cameras`.
-        frame_of: [P] number of each photograph's frame: the faces of a panorama share one; () if
-            there are no panoramas.
+        frame_of: [P] number of each photograph's frame, from 0: the faces of a panorama share one.
         cameras: known intrinsics.
-        masks: [P] mask files, "" for none; () if no photograph has one.
+        masks: [P] mask files, "" for none.
         seed: of RANSAC and the mapper.
         threads: how many to use.
         max_features, peak_threshold: of SIFT (Lowe 2004).
@@ -65,19 +63,21 @@ class Job:
         max_seconds: time limit of mapping.
         source: of a chunk: the database of the whole job; of "learned": that of SIFT.
         photographs, pairs: of a chunk: the positions to process; of "learned": the
-            photographs to join.
+            photographs to join; of known cameras: all pairs to match.
+        known: of known cameras, each of which has one photograph: intrinsics [P, 4] fx, fy, cx, cy;
+            world_to_camera [P, 4, 4]; rotations [P, 3, 3] from the axes of the frame to the
+            camera's.
     """
 
     step: str
     images_root: str
     database: str
     out: str
-    progress: str
     names: tuple[str, ...]
     camera_of: tuple[int, ...]
+    frame_of: tuple[int, ...]
     cameras: tuple[CameraGuess, ...]
-    masks: tuple[str, ...] = ()
-    frame_of: tuple[int, ...] = ()
+    masks: tuple[str, ...]
     seed: int = 0
     threads: int = 1
     max_features: int = 12288
@@ -90,11 +90,12 @@ class Job:
     source: str = ""
     photographs: tuple[int, ...] = ()
     pairs: tuple[tuple[int, int], ...] = ()
+    known: dict[str, list[Any]] = field(default_factory=dict)
 
     @property
     def frames(self) -> NDArray[np.int64]:
-        """[P] number of each photograph's frame, from 0."""
-        return np.array(self.frame_of or range(len(self.names)), np.int64)
+        """[P] `frame_of` as an array."""
+        return np.array(self.frame_of, np.int64)
 
     def write(self, path: Path) -> Path:
         path.write_text(json.dumps(asdict(self)), encoding="utf-8")
@@ -102,12 +103,11 @@ class Job:
 
     @classmethod
     def read(cls, path: Path) -> Job:
-        data = json.loads(path.read_text(encoding="utf-8"))
-        data["names"] = tuple(data["names"])
-        data["camera_of"] = tuple(data["camera_of"])
-        data["masks"] = tuple(data["masks"])
-        data["frame_of"] = tuple(data["frame_of"])
-        data["photographs"] = tuple(data["photographs"])
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        data: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value
+            for name, value in stored.items()
+        }
         data["pairs"] = tuple((first, second) for first, second in data["pairs"])
         cameras = (camera | {"turn": tuple(camera["turn"])} for camera in data["cameras"])
         data["cameras"] = tuple(CameraGuess(**camera) for camera in cameras)
@@ -131,17 +131,15 @@ def job_of(capture: Capture, work: Path, seed: int, max_features: int, matching:
         camera_of.append(positions[key])
     sources = list(dict.fromkeys(photo.source for photo in capture.photos))
     frame = {source: number for number, source in enumerate(sources)}
-    panoramas = any(photo.face for photo in capture.photos)
     return Job(
         step="",
         images_root=str(capture.folder.resolve()),
         database=str(work / "base.db"),
         out="",
-        progress="",
         names=tuple(photo.image for photo in capture.photos),
         masks=tuple(photo.mask for photo in capture.photos),
         camera_of=tuple(camera_of),
-        frame_of=tuple(frame[photo.source] for photo in capture.photos) if panoramas else (),
+        frame_of=tuple(frame[photo.source] for photo in capture.photos),
         cameras=tuple(guesses),
         seed=seed,
         threads=threads.count(),
@@ -150,16 +148,12 @@ def job_of(capture: Capture, work: Path, seed: int, max_features: int, matching:
     )
 
 
-def prepare_work_folder(work: Path, job: Job, known_cameras: str = "") -> None:
-    """Keep what an interrupted run left in `work` if it was the same job; clear it otherwise.
-
-    known_cameras: digest of the known cameras.
-    """
+def prepare_work_folder(work: Path, job: Job) -> None:
+    """Keep what an interrupted run left in `work` if it was the same job; clear it otherwise."""
     description = work / "description.json"
     # Locations and the number of threads change no result.
-    same = {"images_root": "", "database": "", "out": "", "progress": "", "threads": 0}
-    data = asdict(job) | same | {"known_cameras": known_cameras}
-    wanted = json.dumps(data, sort_keys=True)
+    same = {"images_root": "", "database": "", "out": "", "threads": 0}
+    wanted = json.dumps(asdict(job) | same, sort_keys=True)
     try:
         unchanged = description.read_text(encoding="utf-8") == wanted
     except (OSError, ValueError):
@@ -168,12 +162,6 @@ def prepare_work_folder(work: Path, job: Job, known_cameras: str = "") -> None:
         shutil.rmtree(work, ignore_errors=True)
         work.mkdir(parents=True)
         description.write_text(wanted, encoding="utf-8")
-
-
-def known_cameras_path(job: Job) -> Path:
-    """File with the known cameras of `job.names`, for the steps "neighbours" and "triangulation":
-    intrinsics [V, 4] fx, fy, cx, cy; sizes [V, 2]; world_to_camera [V, 4, 4]; pairs [Q, 2]."""
-    return Path(job.database).with_suffix(".known.npz")
 
 
 def similarity_path(job: Job) -> Path:
@@ -196,14 +184,19 @@ def chunks_path(job: Job) -> Path:
     return Path(job.database).with_suffix(".chunks")
 
 
+def progress_path(job: Job) -> Path:
+    """File with the worker's progress (`ProgressWriter`)."""
+    return Path(job.database).with_name("progress.json")
+
+
 _SECONDS = 0.2  # between two writes
 
 
 class ProgressWriter:
-    """Writes the file at `path`."""
+    """Writes `progress_path`."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, job: Job) -> None:
+        self._path = progress_path(job)
         self._next = 0.0
 
     def write(self, phase: str, done: int, total: int) -> None:
@@ -218,10 +211,10 @@ class ProgressWriter:
         os.replace(partial, self._path)
 
 
-def read_progress(path: Path) -> tuple[str, int, int] | None:
+def read_progress(job: Job) -> tuple[str, int, int] | None:
     """(phase, done, total) as last written; None before the first time."""
     try:
-        phase, done, total = json.loads(path.read_text())
+        phase, done, total = json.loads(progress_path(job).read_text())
         return str(phase), int(done), int(total)
     except (OSError, ValueError, TypeError):
         return None

@@ -3,7 +3,6 @@ the camera file, from matches with the poses held fixed, or at random."""
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shutil
@@ -19,21 +18,23 @@ from stages.base.errors import ReconstructionError, SplatError, UsageError
 from stages.base.stage import Report
 from stages.base.text import counted
 from stages.cameras.camera_file import FilePoints
+from stages.cameras.colmap import Observations
 from stages.cameras.table import read_cameras, read_points
 from stages.cameras.undistortion import undistorted_camera
 from stages.scene import Camera, Capture, Photo, Reconstruction
 from stages.scene.rotations import quaternions_of
 from stages.structure import database as sqlite
-from stages.structure.finish import COLMAP, Observations, write_reconstruction
-from stages.structure.job import CameraGuess, Job, known_cameras_path, prepare_work_folder
+from stages.structure.finish import COLMAP, write_reconstruction
+from stages.structure.job import CameraGuess, Job, prepare_work_folder
 from stages.structure.known_points import find_points
 from stages.structure.levelling import levelling_rotation, up_direction
-from stages.structure.match_cameras import PosedPhoto, match_cameras
+from stages.structure.match_cameras import match_cameras
 from stages.structure.metric_scale import KnownScale, find_metric_scale
+from stages.structure.pairs import Pair
 from stages.structure.pinhole_views import PinholeView, write_pinhole_views
 from stages.structure.process import run_step
 from stages.structure.sparse_model import camera_centres
-from stages.structure.undistorted_images import IMAGES, mask_file
+from stages.structure.undistorted_images import IMAGES, PosedPhoto, mask_file
 
 NEIGHBOURS = 10
 _NEXT_IN_ORDER = 2  # photographs, which are matched whatever the poses say
@@ -80,8 +81,7 @@ def reconstruct(
     posed = match_cameras(found, capture, split, allow_partial, report)
     _check_usable(posed, refine)
     shutil.rmtree(folder / COLMAP, ignore_errors=True)
-    photos, taken, lenses = zip(*((p.photo, p.camera, p.lens) for p in posed), strict=True)
-    views = write_pinhole_views(photos, taken, lenses, capture.folder, folder, report)
+    views = write_pinhole_views(posed, capture.folder, folder, report)
     training = [i for i, view in enumerate(views) if posed[view.number].role != "test"]
     job = _job([views[i] for i in training], folder, work, seed, max_features, refine)
     _match(job, work, report, seconds_left)
@@ -92,17 +92,9 @@ def reconstruct(
     cloud, observations = find_points(
         from_file, triangulated, training, views, _whole(views, posed), folder, seed, report
     )
-    georeference = found.georeference
-    if georeference.metres_per_unit and not known_scale.metres_per_unit:
-        known_scale = replace(
-            known_scale,
-            metres_per_unit=georeference.metres_per_unit,
-            source=georeference.source,
-        )
-    known_scale = replace(known_scale, place=georeference.place)
-    axes = georeference.axes
+    known_scale = replace(known_scale, georeference=found.georeference)
     roles = [posed[view.number].role for view in views]
-    return _finish(views, roles, cloud, observations, folder, report, known_scale, axes)
+    return _finish(views, roles, cloud, observations, folder, report, known_scale)
 
 
 def _whole(views: Sequence[PinholeView], posed: Sequence[PosedPhoto]) -> list[Camera]:
@@ -137,34 +129,31 @@ def _job(
     """The job for the training views, each with a camera of its own. The faces of a photograph are
     a rig."""
     photos, chosen = [view.photo for view in views], [view.camera for view in views]
-    known = {
-        "intrinsics": np.array([(c.fx, c.fy, c.cx, c.cy) for c in chosen]),
-        "sizes": np.array([(c.width, c.height) for c in chosen], np.int32),
-        "world_to_camera": np.array([c.world_to_camera for c in chosen]),
-        "rotations": np.array([view.rotation for view in views]),
-        "photographs": np.unique([view.number for view in views], return_inverse=True)[1],
-    }
-    known["pairs"] = neighbours(known["world_to_camera"], known["rotations"], known["photographs"])
-    faces = any(photo.face for photo in photos)
+    photographs = np.unique([view.number for view in views], return_inverse=True)[1]
+    poses = np.array([camera.world_to_camera for camera in chosen])
+    rotations = np.array([view.rotation for view in views])
     job = Job(
         step="",
         images_root=str((folder / IMAGES).resolve()),
         database=str(work / "known.db"),
         out=str(work / "known"),
-        progress=str(work / "progress.json"),
         names=tuple(photo.picture for photo in photos),
         masks=tuple(_mask_from_images(photo) for photo in photos),
         camera_of=tuple(range(len(views))),
-        frame_of=tuple(known["photographs"].tolist()) if faces else (),
+        frame_of=tuple(photographs.tolist()),
         cameras=tuple(_guess(view) for view in views),
         seed=seed,
         threads=threads.count(),
         max_features=max_features,
         refine=refine,
+        pairs=tuple(neighbours(poses, rotations, photographs)),
+        known={
+            "intrinsics": [(c.fx, c.fy, c.cx, c.cy) for c in chosen],
+            "world_to_camera": poses.tolist(),
+            "rotations": rotations.tolist(),
+        },
     )
-    digest = hashlib.sha256(b"".join(np.ascontiguousarray(v).tobytes() for v in known.values()))
-    prepare_work_folder(work, job, digest.hexdigest())
-    np.savez(known_cameras_path(job), **known)  # type: ignore[arg-type]
+    prepare_work_folder(work, job)
     return job
 
 
@@ -181,8 +170,8 @@ def _mask_from_images(photo: Photo) -> str:
 
 def neighbours(
     poses: NDArray[np.float64], faces: NDArray[np.float64], photographs: NDArray[np.int64]
-) -> NDArray[np.int32]:
-    """[Q, 2] pairs to match: each view with those nearest in position and direction, and with the
+) -> list[Pair]:
+    """The pairs to match: each view with those nearest in position and direction, and with the
     same part of the photographs next in order, in case the poses are wrong. The views of one
     photograph show different things, and are not matched.
 
@@ -210,7 +199,7 @@ def neighbours(
         following = photographs[second] - photographs[first] <= _NEXT_IN_ORDER
         keep = selected[first, second] | (following & alike)
         first, second = first[keep], second[keep]
-    return np.stack([first, second], axis=1).astype(np.int32)
+    return list(zip(first.tolist(), second.tolist(), strict=True))
 
 
 def _match(job: Job, work: Path, report: Report, seconds_left: Callable[[], float]) -> None:
@@ -291,10 +280,10 @@ def _finish(
     folder: Path,
     report: Report,
     known_scale: KnownScale,
-    axes: NDArray[np.float64] | None,
 ) -> Reconstruction:
-    """Level, recentre and scale; write the COLMAP model. axes: as in `Georeference`."""
-    turn, levelled = _levelling(views, axes)
+    """Level, recentre and scale; write the COLMAP model."""
+    georeference = known_scale.georeference
+    turn, levelled = _levelling(views, georeference.axes)
     middle = np.median(np.repeat(cloud.points, np.maximum(cloud.tracks, 1), axis=0), axis=0)
     world_from_new = np.eye(4)
     world_from_new[:3, :3], world_from_new[:3, 3] = turn.T, middle
@@ -302,8 +291,9 @@ def _finish(
     points = (cloud.points - middle) @ turn.T
     photos = [view.photo for view in views]
     pictures = [folder / IMAGES / photo.picture for photo in photos]
-    if known_scale.place is not None:
-        known_scale = replace(known_scale, place=known_scale.place.moved(world_from_new))
+    if georeference.place is not None:
+        place = georeference.place.moved(world_from_new)
+        known_scale = replace(known_scale, georeference=replace(georeference, place=place))
     scale = find_metric_scale(known_scale, photos, cameras, pictures, levelled, report)
     if scale is not None:
         points, cameras = scale.points(points), scale.cameras(cameras)

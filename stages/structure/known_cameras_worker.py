@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from stages.cameras.camera_file import poses_of
 from stages.scene.rotations import similarity
 from stages.structure.epipolar import likely_mistakes, median_inlier_ratio
-from stages.structure.job import Job, known_cameras_path
+from stages.structure.job import Job
 from stages.structure.mapping import point_arrays, verified_matches
 from stages.structure.matching import match_pairs
 from stages.structure.sparse_model import camera_centres
@@ -26,11 +26,10 @@ REFINEMENTS = (8.0, 4.0, 2.0, 1.0, 1.0)
 
 def match_neighbours(job: Job) -> None:
     """Match and verify the selected pairs, with the exact intrinsics of the known cameras."""
-    known = np.load(known_cameras_path(job))
     with pycolmap.Database.open(job.database) as database:
-        for number, lens in enumerate(zip(known["intrinsics"], known["sizes"], strict=True), 1):
-            database.update_camera(_camera(number, *lens))
-    match_pairs(job, [(int(first), int(second)) for first, second in known["pairs"]])
+        for camera in _cameras(job):
+            database.update_camera(camera)
+    match_pairs(job, list(job.pairs))
 
 
 def triangulate(job: Job) -> None:
@@ -39,14 +38,15 @@ def triangulate(job: Job) -> None:
     Writes to `job.out`: pose_check.json, inlier ratios of the given poses and of corrections of
     likely mistakes (see `epipolar`); points.npz, points, observations and poses.
     """
-    known = np.load(known_cameras_path(job))
+    lens, poses, faces = (
+        np.array(job.known[name]) for name in ("intrinsics", "world_to_camera", "rotations")
+    )
     out = Path(job.out)
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
     pairs = _matched_points(Path(job.database))
-    lens, poses = known["intrinsics"], known["world_to_camera"]
-    mistakes = _corrected(poses, known["rotations"], known["photographs"])
-    side = float(known["sizes"].max())
+    mistakes = _corrected(poses, faces, job.frames)
+    side = float(max(max(camera.width, camera.height) for camera in job.cameras))
     found = {
         "pairs": len(pairs),
         "matches": sum(len(pair[2]) for pair in pairs),
@@ -58,11 +58,10 @@ def triangulate(job: Job) -> None:
         },
     }
     if job.refine:
-        poses = _refined(job, known, out / "colmap")
+        poses = _refined(job, poses, out / "colmap")
         found["refined"] = median_inlier_ratio(pairs, lens, poses, side)
-        known = {**known, "world_to_camera": poses}
     (out / "pose_check.json").write_text(json.dumps(found), encoding="utf-8")
-    _save_points(_triangulated(job, known, out / "colmap"), poses, out / "points.npz")
+    _save_points(_triangulated(job, poses, out / "colmap"), poses, out / "points.npz")
 
 
 def _corrected(
@@ -82,13 +81,14 @@ def _corrected(
     return {name: turns @ fixed[photographs] for name, fixed in likely_mistakes(whole).items()}
 
 
-def _camera(number: int, lens: NDArray[np.float64], size: NDArray[np.int32]) -> pycolmap.Camera:
-    width, height = int(size[0]), int(size[1])
-    camera = pycolmap.Camera(
-        camera_id=number, model="PINHOLE", width=width, height=height, params=lens
-    )
-    camera.has_prior_focal_length = True
-    return camera
+def _cameras(job: Job) -> Iterator[pycolmap.Camera]:
+    """The camera of each view, with the number of its photograph."""
+    known = zip(job.cameras, job.known["intrinsics"], strict=True)
+    for number, (guess, params) in enumerate(known, 1):
+        size = {"width": guess.width, "height": guess.height}
+        camera = pycolmap.Camera(camera_id=number, model="PINHOLE", params=params, **size)
+        camera.has_prior_focal_length = True
+        yield camera
 
 
 def _matched_points(path: Path) -> list[tuple[int, int, NDArray[np.float64], NDArray[np.float64]]]:
@@ -106,16 +106,16 @@ def _matched_points(path: Path) -> list[tuple[int, int, NDArray[np.float64], NDA
     return found
 
 
-def _refined(job: Job, known: Mapping[str, Any], scratch: Path) -> NDArray[np.float64]:
-    """[V, 4, 4] the poses after rounds of triangulation and bundle adjustment, intrinsics fixed.
+def _refined(job: Job, given: NDArray[np.float64], scratch: Path) -> NDArray[np.float64]:
+    """[V, 4, 4] the `given` poses after rounds of triangulation and bundle adjustment, with fixed
+    intrinsics.
 
     Early rounds use wide error thresholds, since the poses are rough. The result is aligned to the
     given camera centres by a similarity, so that the world stays the given one.
     """
-    given = np.asarray(known["world_to_camera"], np.float64)
     poses = given
     for slack in REFINEMENTS:
-        model = _triangulated(job, {**known, "world_to_camera": poses}, scratch, slack)
+        model = _triangulated(job, poses, scratch, slack)
         options = pycolmap.BundleAdjustmentOptions()
         options.refine_focal_length = options.refine_extra_params = False
         options.refine_sensor_from_rig = False  # the faces of a photograph lie exactly
@@ -127,19 +127,18 @@ def _refined(job: Job, known: Mapping[str, Any], scratch: Path) -> NDArray[np.fl
         for number in sorted(model.reg_image_ids()):
             poses[number - 1, :3] = model.images[number].cam_from_world().matrix()
     scale, turn, shift = similarity(camera_centres(poses), camera_centres(given))
-    rotations = poses[:, :3, :3] @ turn.T
     centres = scale * camera_centres(poses) @ turn.T + shift
-    poses[:, :3, :3] = rotations
-    poses[:, :3, 3] = -np.einsum("vij,vj->vi", rotations, centres)
+    poses[:, :3] = poses_of(poses[:, :3, :3] @ turn.T, centres)
     return poses
 
 
 def _triangulated(
-    job: Job, known: Mapping[str, Any], scratch: Path, slack: float = 1.0
+    job: Job, poses: NDArray[np.float64], scratch: Path, slack: float = 1.0
 ) -> pycolmap.Reconstruction:
-    """Triangulate the matches with fixed poses. slack: factor on COLMAP's error thresholds."""
+    """Triangulate the matches with fixed poses [V, 4, 4]. slack: factor on COLMAP's error
+    thresholds."""
     scratch.mkdir()
-    model = _posed(job, known)
+    model = _posed(job, poses)
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
     options.random_seed = options.mapper.random_seed = job.seed
@@ -159,20 +158,19 @@ def _triangulated(
     return model
 
 
-def _posed(job: Job, known: Mapping[str, Any]) -> pycolmap.Reconstruction:
+def _posed(job: Job, poses: NDArray[np.float64]) -> pycolmap.Reconstruction:
     """A model of the views, without points, with the rigs and frames of the database. Each view has
     a camera of its own with the same number."""
     model = pycolmap.Reconstruction()
-    for number, lens in enumerate(zip(known["intrinsics"], known["sizes"], strict=True), 1):
-        model.add_camera(_camera(number, *lens))
+    for camera in _cameras(job):
+        model.add_camera(camera)
     frame_of: dict[int, int] = {}
     with pycolmap.Database.open(job.database) as database:
         for rig in database.read_all_rigs():
             model.add_rig(rig)
         for frame in database.read_all_frames():
             frame_of |= {data.id: frame.frame_id for data in frame.data_ids}
-            reference = known["world_to_camera"][frame.rig_id - 1]
-            frame.rig_from_world = pycolmap.Rigid3d(reference[:3])
+            frame.rig_from_world = pycolmap.Rigid3d(poses[frame.rig_id - 1, :3])
             model.add_frame(frame)
     for number, name in enumerate(job.names, 1):
         image = pycolmap.Image(name=name, camera_id=number, image_id=number)

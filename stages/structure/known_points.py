@@ -16,9 +16,9 @@ from stages.base.errors import SplatError
 from stages.base.stage import Report
 from stages.base.text import counted, listed
 from stages.cameras.camera_file import FilePoints
+from stages.cameras.colmap import NO_OBSERVATIONS, Observations
 from stages.photos.load import load_mask
 from stages.scene import TRANSPARENT, Camera
-from stages.structure.finish import NO_OBSERVATIONS, Observations
 from stages.structure.pinhole_views import PinholeView
 from stages.structure.undistorted_images import mask_file
 

@@ -54,10 +54,10 @@ def match_learned(job: Job) -> None:
 
 def _features(job: Job) -> list[LearnedFeatures]:
     """The learned features of each photograph, by position."""
-    network, root, progress = XFeat(), Path(job.images_root), ProgressWriter(Path(job.progress))
+    network, root, progress = XFeat(), Path(job.images_root), ProgressWriter(job)
 
     def of_photograph(position: int) -> LearnedFeatures:
-        mask = job.masks[position] if job.masks else ""
+        mask = job.masks[position]
         picture = read_grey(root / job.names[position])
         return network.features(picture, read_grey(root / mask) if mask else None)
 
@@ -73,7 +73,7 @@ def _likeness(job: Job, features: list[LearnedFeatures]) -> NDArray[np.int32]:
     """[P, P] mutual nearest neighbours of the best features of `job.photographs` and all others; 0
     for pairs without one of them."""
     frames = job.frames
-    photographs, progress = len(features), ProgressWriter(Path(job.progress))
+    photographs, progress = len(features), ProgressWriter(job)
     likeness = np.zeros((photographs, photographs), np.int32)
     for done, i in enumerate(job.photographs, 1):
         for j in range(photographs):
@@ -102,7 +102,7 @@ def _write_matches(
 ) -> None:
     """Match the `wanted` pairs, add SIFT's matches, verify both together and write them, but for
     pairs that only learned features verify and that stronger ones make redundant."""
-    progress = ProgressWriter(Path(job.progress))
+    progress = ProgressWriter(job)
     matcher = _Matcher(job, [database.read_camera(camera + 1) for camera in job.camera_of])
     inliers = sqlite.inliers_of_pairs(Path(job.source))
     inliers = {pair: count for pair, count in inliers.items() if count}

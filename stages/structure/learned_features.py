@@ -97,10 +97,7 @@ class XFeat:
         """(descriptors [1, 64, H/8, W/8], scores of keypoints [1, 1, H, W], reliability
         [1, 1, H/8, W/8]) of a picture [1, 1, H, W]."""
         grey = functional.instance_norm(grey)
-        skip = functional.avg_pool2d(grey, 4)
-        skip = functional.conv2d(
-            skip, self._weights["skip1.1.weight"], self._weights["skip1.1.bias"]
-        )
+        skip = self._pointwise(functional.avg_pool2d(grey, 4), "skip1.1")
         levels = []
         x = grey
         for block, steps in _ENCODER:

@@ -60,14 +60,14 @@ def with_light(reconstruction: Reconstruction, report: Report) -> Reconstruction
     """The reconstruction with `View.light` and `View.vignetting`, measured at the points of its
     COLMAP model, and the share of the points' scatter that the light explains. Training decides
     whether they are corrected."""
-    model = read_model(reconstruction.folder / SPARSE)[1]
+    _, _, observed = read_model(reconstruction.folder / SPARSE)
     pictures = [reconstruction.folder / view.image for view in reconstruction.views]
     found = measure_light(
         pictures,
         [view.camera for view in reconstruction.views],
-        model.observed_points,
-        model.observing_views,
-        model.observed_px,
+        observed.points,
+        observed.views,
+        observed.px,
         tick=lambda done: report.progress(done, len(pictures), "measuring light"),
     )
     lights = [

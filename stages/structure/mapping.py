@@ -109,7 +109,7 @@ def _incremental(job: Job, scratch: Path) -> dict[int, pycolmap.Reconstruction]:
         options.mapper.init_min_num_inliers = 50
         options.mapper.init_min_tri_angle = 8.0
     registered = itertools.count(1)
-    progress = ProgressWriter(Path(job.progress))
+    progress = ProgressWriter(job)
 
     def new_model() -> None:
         nonlocal registered
@@ -235,7 +235,7 @@ def _pair_inlier_ratios(
 ) -> dict[str, np.ndarray]:
     """`SparseModel.pairs` and `pair_inlier_ratios`: of the matches that two-view geometry verified,
     the share that also fits the model's poses; 0 for the pairs of `_turned_pairs`."""
-    progress = ProgressWriter(Path(job.progress))
+    progress = ProgressWriter(job)
     normalised: dict[int, np.ndarray] = {}  # undistorted pixels, relative to the principal point
     focal = {i: model.cameras[model.images[i].camera_id].mean_focal_length() for i in position}
     intrinsics = np.array([(focal[i], focal[i], 0.0, 0.0) for i in position])

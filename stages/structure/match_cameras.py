@@ -5,31 +5,20 @@ from __future__ import annotations
 import unicodedata
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import PurePosixPath
 
 from stages.base.errors import SplatError, UsageError
 from stages.base.stage import Report
 from stages.base.text import counted, listed
 from stages.cameras.camera_file import CameraFile
-from stages.cameras.lens import Lens
 from stages.photos.sources import LOSSLESS, LOSSY, OTHER_PICTURES, RAW
 from stages.scene import Camera, Capture, Photo, View
+from stages.structure.undistorted_images import PosedPhoto
 
 _SUFFIXES = LOSSY | LOSSLESS | RAW | OTHER_PICTURES
 _FEWEST = 3  # photographs
 _SHAPE_TOLERANCE = 0.01
 _PARTIAL = "--allow-partial goes on with those that match."
-
-
-@dataclass(frozen=True)
-class PosedPhoto:
-    """A photograph, its camera in pixels of the photograph, its lens and its role."""
-
-    photo: Photo
-    camera: Camera
-    lens: Lens
-    role: str
 
 
 def match_cameras(

@@ -74,7 +74,6 @@ def select_pairs(job: Job) -> None:
 def match_chunk(job: Job) -> None:
     """Match and verify the pairs of the job's chunk, into a database of its own."""
     new_database.create(Path(job.database), job, ())
-    sqlite.take_cameras(Path(job.database), Path(job.source))
     with _matcher(job, job.source, immutable=True) as matcher:
         matcher.run(list(job.pairs))
 
@@ -122,7 +121,7 @@ class _IndexedFeatures:
         """Of all photographs; stored beside the database, for chunks and resumed runs."""
         path, photographs = vocabulary_path(self._job), len(self._job.names)
         if not path.exists():
-            progress = ProgressWriter(Path(self._job.progress))
+            progress = ProgressWriter(self._job)
             most = max(1, SAMPLED_DESCRIPTORS // photographs)
             rows = []
             for i in range(photographs):
@@ -154,7 +153,7 @@ class _Matcher:
         self.inliers = sqlite.inliers_of_pairs(Path(job.database))
         self._job, self._database, self._stored = job, database, stored
         self._cameras = [database.read_camera(camera + 1) for camera in job.camera_of]
-        self._progress = ProgressWriter(Path(job.progress))
+        self._progress = ProgressWriter(job)
 
     def run(self, wanted: list[Pair]) -> None:
         """Match the `wanted` pairs, except those that are matched."""
@@ -194,7 +193,7 @@ def _similarity(job: Job, features: _IndexedFeatures) -> NDArray[np.int32]:
         found: NDArray[np.int32] = np.load(stored)["similarity"]
         return found
     features.vocabulary()
-    progress = ProgressWriter(Path(job.progress))
+    progress = ProgressWriter(job)
     similarity = np.zeros((photographs, photographs), np.int32)
     indices, words_of = [], []
     with ThreadPoolExecutor(job.threads) as pool:

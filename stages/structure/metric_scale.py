@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from stages.base.errors import ReconstructionError, SplatError, UsageError
 from stages.base.stage import Report
+from stages.cameras.camera_file import NO_GEOREFERENCE, Georeference
 from stages.scene import Camera, Photo
-from stages.scene.place import EarthPlace
 from stages.structure.gps import MetricScale, scale_from_gps
 from stages.structure.markers import marker_sides
 
@@ -27,18 +27,16 @@ class KnownScale:
     Args:
         distance: names of two photographs and the distance of their cameras in metres; or ().
         marker: side of the printed markers in metres; 0 for none.
-        metres_per_unit: of known cameras; 0 if unknown.
-        source: what states metres_per_unit.
-        place: of the world of known cameras; None if unknown.
         crs: the projected coordinate reference system to turn the world to; "" for none.
+        metres: whether the user says that known cameras are in metres.
+        georeference: what the file of known cameras says.
     """
 
     distance: Sequence[str] = ()
     marker: float = 0.0
-    metres_per_unit: float = 0.0
-    source: str = ""
-    place: EarthPlace | None = None
     crs: str = ""
+    metres: bool = False
+    georeference: Georeference = NO_GEOREFERENCE
 
 
 UNKNOWN_SCALE = KnownScale()
@@ -75,8 +73,10 @@ def find_metric_scale(
             )
     elif known.marker:
         metric = _from_markers(known.marker, marker_sides(pictures, cameras), report)
-    elif known.metres_per_unit:
-        metric = MetricScale(known.metres_per_unit, known.source)
+    elif known.metres:
+        metric = MetricScale(1.0, "--metres")
+    elif known.georeference.metres_per_unit:
+        metric = MetricScale(known.georeference.metres_per_unit, known.georeference.source)
     else:
         metric = scale_from_gps(photos, centres, levelled, report)
     metric = _placed(metric, known, report)
@@ -89,9 +89,10 @@ def find_metric_scale(
 
 def _placed(metric: MetricScale | None, known: KnownScale, report: Report) -> MetricScale | None:
     """With the place of known cameras, and turned to the grid that is requested."""
-    if metric is not None and known.place is not None:
-        new_from_old = replace(MetricScale(1.0, metric.source), place=known.place)
-        metric = new_from_old.followed_by(metric.metres, metric.turn)
+    place = known.georeference.place
+    if metric is not None and place is not None:
+        old = MetricScale(1.0, metric.source, place=place)
+        metric = old.followed_by(metric.metres, metric.turn)
     if not known.crs:
         return metric
     if metric is None or metric.place is None:

@@ -80,9 +80,7 @@ def linking_pairs(
     links = frames[np.array(list(linked), np.int64).reshape(-1, 2)]
     degree = np.bincount(links.reshape(-1), minlength=most)[frames]
     group = np.zeros(most, np.int64)
-    for number, members in enumerate(
-        connected_groups([(*pair, 0, 0) for pair in links.tolist()], most)
-    ):
+    for number, members in enumerate(connected_groups(links.tolist(), most)):
         group[members] = number
     group = group[frames]
     few = degree < FEWEST_LINKS

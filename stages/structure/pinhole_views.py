@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from stages.base.errors import Interrupted
 from stages.base.stage import Report
 from stages.base.text import listed
-from stages.cameras.lens import MAX_ANGLE, Lens
+from stages.cameras.lens import MAX_ANGLE
 from stages.photos.faces import face_photo
 from stages.photos.fisheye_faces import Field, FisheyeFace, faces_of, only_face, shown_share
 from stages.photos.image_circle import LOOKED_AT, brightest, circle_radius
@@ -26,6 +26,7 @@ from stages.scene import IGNORE, TRANSPARENT, Camera, Face, Photo, evenly_spaced
 from stages.scene.rotations import quaternions_of
 from stages.structure.undistorted_images import (
     IMAGES,
+    PosedPhoto,
     depth_file,
     mask_file,
     read_picture,
@@ -36,7 +37,6 @@ from stages.structure.undistorted_images import (
 _LOST_SHARE = 0.02
 
 _Tables = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]  # x, y, inside
-_Key = tuple[object, ...]
 
 
 @dataclass(frozen=True)
@@ -65,74 +65,58 @@ class _Cut:
 
 
 def write_pinhole_views(
-    photos: Sequence[Photo],
-    cameras: Sequence[Camera],
-    lenses: Sequence[Lens],
-    source: Path,
-    folder: Path,
-    report: Report,
+    posed: Sequence[PosedPhoto], source: Path, folder: Path, report: Report
 ) -> list[PinholeView]:
     """Write pinhole pictures, masks and depth maps; those of a photograph follow each other.
 
     Arguments as of `write_undistorted_images`. `report` also receives how much is lost. Raises
     Interrupted, and SplatError "sfm-photo-unreadable".
     """
-    cuts = _cuts(photos, cameras, lenses, source, report)
+    cuts = _cuts(posed, source, report)
     plain = [i for i, cut in enumerate(cuts) if cut is None]
     views: list[PinholeView] = []
     shown = 0.0
     if plain:
-        pinholes, share = write_undistorted_images(
-            [photos[i] for i in plain],
-            [cameras[i] for i in plain],
-            [lenses[i] for i in plain],
-            source,
-            folder,
-            report,
-        )
+        whole = [posed[i] for i in plain]
+        pinholes, share = write_undistorted_images(whole, source, folder, report)
         shown += share * len(plain)
-        eye = np.eye(3)
-        views += [PinholeView(photos[i], c, i, eye) for i, c in zip(plain, pinholes, strict=True)]
+        views += [
+            PinholeView(posed[i].photo, camera, i, np.eye(3))
+            for i, camera in zip(plain, pinholes, strict=True)
+        ]
     tables: dict[int, list[_Tables]] = {}  # of the last field: they are large
     for number, cut in enumerate(cuts):
         if cut is None:
             continue
         if report.stop_requested.is_set():
             raise Interrupted
-        report.progress(number, len(photos), "undistorting", photographs=number)
+        report.progress(number, len(posed), "undistorting", photographs=number)
         if id(cut) not in tables:
             tables = {id(cut): [_tables(cut.field, face) for face in cut.faces]}
-        views += _write_faces(
-            photos[number], cameras[number], number, cut, tables[id(cut)], source, folder
-        )
+        views += _write_faces(posed[number], number, cut, tables[id(cut)], source, folder)
         shown += shown_share(cut.field, cut.faces)
-    report.progress(len(photos), len(photos), "undistorting", photographs=len(photos))
-    _report(photos, cuts, 1.0 - shown / len(photos), report)
+    report.progress(len(posed), len(posed), "undistorting", photographs=len(posed))
+    _report(cuts, 1.0 - shown / len(posed), report)
     return sorted(views, key=lambda view: view.number)
 
 
-def _cuts(
-    photos: Sequence[Photo],
-    cameras: Sequence[Camera],
-    lenses: Sequence[Lens],
-    source: Path,
-    report: Report,
-) -> list[_Cut | None]:
+def _cuts(posed: Sequence[PosedPhoto], source: Path, report: Report) -> list[_Cut | None]:
     """[V] None for a photograph of which one pinhole picture is made, without a mask for its lens.
     Photographs of one camera share one `_Cut`."""
-    groups: dict[_Key, list[int]] = defaultdict(list)
-    for i, (c, lens) in enumerate(zip(cameras, lenses, strict=True)):
-        if lens.by_angle:
-            groups[lens, c.width, c.height, c.fx, c.fy, c.cx, c.cy].append(i)
-    cuts: list[_Cut | None] = [None] * len(photos)
+    photos = [taken.photo for taken in posed]
+    groups: dict[tuple[object, ...], list[int]] = defaultdict(list)
+    for i, taken in enumerate(posed):
+        if taken.lens.by_angle:
+            groups[taken.optics].append(i)
+    cuts: list[_Cut | None] = [None] * len(posed)
     folded: list[str] = []
     for members in groups.values():
-        camera = cameras[members[0]]
+        camera, lens = posed[members[0]].camera, posed[members[0]].lens
         opaque = [i for i in members if photos[i].outside != TRANSPARENT]
         chosen = evenly_spaced(opaque, LOOKED_AT)
         pictures = (read_picture(source / photos[i].image) for i in chosen)
         radius = circle_radius(brightest(pictures), camera) if chosen else float("inf")
-        field = Field(camera, lenses[members[0]], radius)
+        field = Field(camera, lens, radius)
         if field.folded_share() > _LOST_SHARE:
             folded += [photos[i].name for i in members]
         faces = faces_of(field)
@@ -158,8 +142,7 @@ def _tables(field: Field, face: FisheyeFace) -> _Tables:
 
 
 def _write_faces(
-    photo: Photo,
-    camera: Camera,
+    taken: PosedPhoto,
     number: int,
     cut: _Cut,
     tables: Sequence[_Tables],
@@ -167,6 +150,7 @@ def _write_faces(
     folder: Path,
 ) -> Iterator[PinholeView]:
     """Writes the faces of a photograph, except those of which its mask leaves nothing."""
+    photo = taken.photo
     image = read_picture(source / photo.image)
     mask = read_picture(source / photo.mask)[..., 0] if photo.mask else None
     for face, (x, y, inside) in zip(cut.faces, tables, strict=True):
@@ -181,7 +165,7 @@ def _write_faces(
         if part.depth:
             depth = _depth(load_depth(source / photo.depth), cut.field, face)
             write_depth(folder / depth_file(part), depth)
-        pose = camera.world_to_camera.copy()
+        pose = taken.camera.world_to_camera.copy()
         pose[:3] = face.rotation @ pose[:3]
         yield PinholeView(part, replace(face.camera, world_to_camera=pose), number, face.rotation)
 
@@ -234,12 +218,10 @@ def _depth(depth: NDArray[np.float32], field: Field, face: FisheyeFace) -> NDArr
     return np.where(inside, found / np.where(inside, z, 1.0), 0.0).astype(np.float32)
 
 
-def _report(
-    photos: Sequence[Photo], cuts: Sequence[_Cut | None], lost: float, report: Report
-) -> None:
-    several = [p for p, cut in zip(photos, cuts, strict=True) if cut and len(cut.faces) > 1]
+def _report(cuts: Sequence[_Cut | None], lost: float, report: Report) -> None:
+    several = sum(cut is not None and len(cut.faces) > 1 for cut in cuts)
     if several:
-        report.metric("wide_fisheyes", len(several))
+        report.metric("wide_fisheyes", several)
     report.metric("area_lost_by_undistortion", round(lost, 4))
     if lost > _LOST_SHARE:
         report.warn(

@@ -13,7 +13,7 @@ from stages.base.disk import disk_full
 from stages.base.errors import Interrupted, ReconstructionError
 from stages.base.parent import end_child, how_it_ended, python_module, start_child
 from stages.base.stage import Report
-from stages.structure.job import Job, read_progress
+from stages.structure.job import Job, progress_path, read_progress
 
 _POLL_SECONDS = 0.1
 _TICK_SECONDS = 0.5
@@ -92,12 +92,11 @@ def run_worker(
 
 def run_step(job: Job, folder: Path, report: Report, max_seconds: float, suffix: str = "") -> None:
     """`run_worker`, with the worker's progress passed to `report`. suffix: added to its phases."""
-    path = Path(job.progress)
     unit = "pairs" if job.step in ("matching", "neighbours", "learned") else "photographs"
-    path.unlink(missing_ok=True)
+    progress_path(job).unlink(missing_ok=True)
 
     def tick() -> None:
-        progress = read_progress(path)
+        progress = read_progress(job)
         if progress is not None:
             phase, done, total = progress
             report.progress(done, total, phase + suffix, **{unit: done})

@@ -140,9 +140,9 @@ class MappingResult:
     """model: the largest, or None. groups: names in each model found, largest first. timed_out:
     whether the mapper ran out of time."""
 
-    model: SparseModel | None
-    groups: tuple[tuple[str, ...], ...]
-    timed_out: bool
+    model: SparseModel | None = None
+    groups: tuple[tuple[str, ...], ...] = ()
+    timed_out: bool = False
 
 
 def save_model(

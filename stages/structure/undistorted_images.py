@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -34,6 +34,23 @@ _JPEG = (
 _Tables = tuple[np.ndarray, np.ndarray]
 
 
+@dataclass(frozen=True)
+class PosedPhoto:
+    """A photograph, its camera in pixels of the photograph, its lens and its role in the split of a
+    benchmark."""
+
+    photo: Photo
+    camera: Camera
+    lens: Lens
+    role: str = ""
+
+    @property
+    def optics(self) -> tuple[object, ...]:
+        """Lens, size and intrinsics: equal for photographs of which one undistortion serves."""
+        c = self.camera
+        return self.lens, c.width, c.height, c.fx, c.fy, c.cx, c.cy
+
+
 def mask_file(photo: Photo) -> str:
     """Path of a photograph's undistorted mask in the reconstruction; "" without one."""
     return f"{MASKS}/{photo.picture}.png" if photo.mask else ""
@@ -45,19 +62,13 @@ def depth_file(photo: Photo) -> str:
 
 
 def write_undistorted_images(
-    photos: Sequence[Photo],
-    cameras: Sequence[Camera],
-    lenses: Sequence[Lens],
-    source: Path,
-    folder: Path,
-    report: Report,
+    posed: Sequence[PosedPhoto], source: Path, folder: Path, report: Report
 ) -> tuple[list[Camera], float]:
     """Write undistorted pictures, masks and depth maps. A photograph without distortion is copied
     unchanged.
 
     Args:
-        photos: V photographs.
-        cameras, lenses: [V] of the photographs as they were taken.
+        posed: V photographs.
         source: the folder of the capture.
         folder: the folder of the reconstruction.
         report: receives progress.
@@ -70,11 +81,11 @@ def write_undistorted_images(
     pinholes, shares = [], []
     known: dict[tuple[object, ...], tuple[Camera, float]] = {}
     tables: dict[tuple[object, ...], _Tables] = {}  # of the last camera: they are large
-    for done, (photo, camera, lens) in enumerate(zip(photos, cameras, lenses, strict=True)):
+    for done, taken in enumerate(posed):
         if report.stop_requested.is_set():
             raise Interrupted
-        report.progress(done, len(photos), "undistorting", photographs=done)
-        key = (lens, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        report.progress(done, len(posed), "undistorting", photographs=done)
+        photo, camera, lens, key = taken.photo, taken.camera, taken.lens, taken.optics
         if key not in known:
             pinhole = undistorted_camera(camera, lens)
             known[key] = pinhole, visible_share(camera, lens, pinhole)
@@ -83,10 +94,10 @@ def write_undistorted_images(
         shares.append(share)
         if lens.distorts and key not in tables:
             tables = {key: remap_tables(camera, lens, pinhole)}
-        _write_picture(photo, source, folder, tables[key] if lens.distorts else None)
-        _write_mask(photo, source, folder, tables[key] if lens.distorts else None)
-        _write_depth(photo, source, folder, camera, lens, pinhole)
-    report.progress(len(photos), len(photos), "undistorting", photographs=len(photos))
+        _write_picture(photo, source, folder, tables.get(key))
+        _write_mask(photo, source, folder, tables.get(key))
+        _write_depth(taken, source, folder, pinhole)
+    report.progress(len(posed), len(posed), "undistorting", photographs=len(posed))
     return pinholes, float(np.mean(shares))
 
 
@@ -113,10 +124,9 @@ def _write_mask(photo: Photo, source: Path, folder: Path, tables: _Tables | None
     write_picture_as(folder / mask_file(photo), mask)
 
 
-def _write_depth(
-    photo: Photo, source: Path, folder: Path, camera: Camera, lens: Lens, pinhole: Camera
-) -> None:
+def _write_depth(taken: PosedPhoto, source: Path, folder: Path, pinhole: Camera) -> None:
     """At the depth map's own number of pixels a degree, without interpolation across edges."""
+    photo, camera, lens = taken.photo, taken.camera, taken.lens
     if not photo.depth:
         return
     depth = load_depth(source / photo.depth)

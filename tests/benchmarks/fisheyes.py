@@ -34,7 +34,7 @@ from stages.scene import Camera, Photo, load_splats
 from stages.scene.capture import HELD_OUT_EVERY
 from stages.scene.rotations import quaternions_of
 from stages.structure.pinhole_views import PinholeView, write_pinhole_views
-from stages.structure.undistorted_images import IMAGES, mask_file
+from stages.structure.undistorted_images import IMAGES, PosedPhoto, mask_file
 from tests.benchmarks import panoramas
 
 SIDE = 800  # pixels; 255 a radian
@@ -135,7 +135,8 @@ def cut(number: int, camera: Camera, photos: Path, folder: Path) -> list[Pinhole
     """The faces of a picture, written to `folder`."""
     side = camera.width
     photo = Photo(name(number), name(number), side, side, None, "fisheye", 1.0, 0.0, None)
-    return write_pinhole_views([photo], [camera], [Lens("fisheye")], photos, folder, Report())
+    posed = [PosedPhoto(photo, camera, Lens("fisheye"))]
+    return write_pinhole_views(posed, photos, folder, Report())
 
 
 def seen_by(one: Camera, view: PinholeView) -> NDArray[np.bool_]:

@@ -9,21 +9,21 @@ import numpy as np
 import pytest
 
 from stages.base.errors import SplatError
+from stages.cameras.camera_file import CameraFile
 from stages.cameras.colmap import (
-    ColmapModel,
     locate,
     read,
     read_model,
     read_points,
-    write_colmap_model,
+    write_model,
 )
-from tests.cameras.models import example
+from tests.cameras.models import Model, example
 
 
 def test_colmap_reads_what_was_written(tmp_path: Path) -> None:
     pycolmap = pytest.importorskip("pycolmap")
     model = example()
-    write_colmap_model(tmp_path / "0", model)
+    model.write(tmp_path / "0")
     read = pycolmap.Reconstruction(tmp_path / "0")
     assert sorted(path.name for path in (tmp_path / "0").iterdir()) == [
         "cameras.bin",
@@ -37,66 +37,65 @@ def test_colmap_reads_what_was_written(tmp_path: Path) -> None:
         assert np.allclose(image.cam_from_world().matrix(), camera.world_to_camera[:3], atol=1e-12)
         assert read.cameras[image.camera_id].focal_length_x == camera.fx
     for number, point in read.points3D.items():
-        assert (point.xyz == model.points[number - 1]).all()
-        assert (point.color == model.colours[number - 1]).all()
+        assert (point.xyz == model.cloud.points[number - 1]).all()
+        assert (point.color == model.cloud.colours[number - 1]).all()
     # Tracks and observations name each other rightly: COLMAP finds no reprojection error.
     read.update_point_3d_errors()
     assert read.compute_mean_reprojection_error() < 1e-9
-    assert read.compute_num_observations() == len(model.observed_points)
+    assert read.compute_num_observations() == len(model.observations.points)
 
 
 def test_equal_models_give_equal_bytes(tmp_path: Path) -> None:
-    write_colmap_model(tmp_path / "a", example())
-    write_colmap_model(tmp_path / "b", example())
+    example().write(tmp_path / "a")
+    example().write(tmp_path / "b")
     for name in ("cameras.bin", "images.bin", "points3D.bin"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
 def test_a_model_without_points_is_still_a_model(tmp_path: Path) -> None:
     pycolmap = pytest.importorskip("pycolmap")
-    none = np.zeros(0, np.int32)
-    model = replace(
-        example(),
-        points=np.zeros((0, 3)),
-        colours=np.zeros((0, 3), np.uint8),
-        errors_px=np.zeros(0),
-        observed_points=none,
-        observing_views=none,
-        observed_px=np.zeros((0, 2)),
-    )
-    write_colmap_model(tmp_path, model)
+    write_model(tmp_path, example().names, example().cameras)
     assert pycolmap.Reconstruction(tmp_path).num_reg_images() == 5
 
 
-def assert_same(found: ColmapModel, wanted: ColmapModel) -> None:
+def assert_same(found: Model, wanted: Model) -> None:
     assert found.names == wanted.names
     for ours, theirs in zip(found.cameras, wanted.cameras, strict=True):
         assert replace(ours, world_to_camera=theirs.world_to_camera) == theirs
         np.testing.assert_allclose(ours.world_to_camera, theirs.world_to_camera, atol=1e-14)
-    for name in ("points", "colours", "observed_points", "observing_views", "observed_px"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name))
+    for name in ("points", "colours", "tracks"):
+        np.testing.assert_array_equal(getattr(found.cloud, name), getattr(wanted.cloud, name))
+    for name in ("points", "views", "px"):
+        np.testing.assert_array_equal(
+            getattr(found.observations, name), getattr(wanted.observations, name)
+        )
+
+
+def read_back(folder: Path) -> tuple[CameraFile, Model]:
+    found, cloud, observations = read_model(folder)
+    names = tuple(view.name for view in found.views)
+    return found, Model(names, tuple(view.camera for view in found.views), cloud, observations)
 
 
 def test_what_is_written_is_read_back(tmp_path: Path) -> None:
-    write_colmap_model(tmp_path / "sparse" / "0", example())
+    example().write(tmp_path / "sparse" / "0")
     folder = locate(tmp_path)
     assert folder == tmp_path / "sparse" / "0"
-    cameras, model = read_model(folder)
+    cameras, model = read_back(folder)
     assert_same(model, example())
-    np.testing.assert_array_equal(model.errors_px, example().errors_px)
-    assert [view.name for view in cameras.views] == list(example().names)
+    np.testing.assert_array_equal(model.cloud.errors_px, example().cloud.errors_px)
     assert cameras.distorted == 0
 
 
 @pytest.mark.parametrize("text", [False, True])
 def test_what_colmap_writes_is_read(tmp_path: Path, text: bool) -> None:
     pycolmap = pytest.importorskip("pycolmap")
-    write_colmap_model(tmp_path / "ours", example())
+    example().write(tmp_path / "ours")
     theirs = tmp_path / "theirs"
     theirs.mkdir()
     loaded = pycolmap.Reconstruction(tmp_path / "ours")
     (loaded.write_text if text else loaded.write_binary)(str(theirs))
-    _, model = read_model(theirs)
+    _, model = read_back(theirs)
     order = np.argsort(model.names)
     wanted = np.argsort(example().names)
     assert [model.names[i] for i in order] == [example().names[i] for i in wanted]
@@ -104,8 +103,8 @@ def test_what_colmap_writes_is_read(tmp_path: Path, text: bool) -> None:
         ours, known = model.cameras[i], example().cameras[j]
         assert (ours.width, ours.height, ours.fx, ours.cy) == (640, 480, known.fx, 240.0)
         np.testing.assert_allclose(ours.world_to_camera, known.world_to_camera, atol=1e-13)
-    assert len(model.points) == 30
-    assert len(model.observed_points) == len(example().observed_points)
+    assert len(model.cloud.points) == 30
+    assert len(model.observations.points) == len(example().observations.points)
 
 
 @pytest.mark.parametrize(
@@ -145,7 +144,7 @@ def test_a_text_model_of_known_cameras_needs_no_points(tmp_path: Path, points: s
 
 
 def damaged(folder: Path, name: str, change) -> None:
-    write_colmap_model(folder, example())
+    example().write(folder)
     path = folder / f"{name}.bin"
     path.write_bytes(change(path.read_bytes()))
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stages.cameras.colmap import read_model, write_colmap_model
+from stages.cameras.colmap import read_model
 from stages.cameras.table import read_cameras
 from tests.cameras.models import example
 
@@ -20,7 +20,7 @@ def poses(path: Path) -> dict[str, np.ndarray]:
 
 def project(folder: Path) -> Path:
     """A COLMAP project as COLMAP lays it out."""
-    write_colmap_model(folder / "sparse" / "0", example())
+    example().write(folder / "sparse" / "0")
     for name in example().names:
         picture = folder / "images" / name
         picture.parent.mkdir(parents=True, exist_ok=True)
@@ -48,9 +48,9 @@ def test_colmap_keeps_its_points(splat, tmp_path: Path) -> None:
     result = splat("cameras", "project", "copy", "--json")
     told = json.loads(result.stdout)
     assert (told["cameras"], told["points"], told["pictures_found"]) == (5, 30, True)
-    _, model = read_model(Path("copy"))
-    np.testing.assert_array_equal(model.points, example().points)
-    np.testing.assert_array_equal(model.observed_px, example().observed_px)
+    _, cloud, observations = read_model(Path("copy"))
+    np.testing.assert_array_equal(cloud.points, example().cloud.points)
+    np.testing.assert_array_equal(observations.px, example().observations.px)
 
 
 def test_a_run_gives_what_its_sfm_found(splat, pretend, tmp_path: Path) -> None:
@@ -91,7 +91,7 @@ def test_lenses_that_distort_are_refused(splat, tmp_path: Path) -> None:
 
 
 def test_missing_pictures_are_reported(splat, tmp_path: Path) -> None:
-    write_colmap_model(tmp_path / "model", example())
+    example().write(tmp_path / "model")
     result = splat("cameras", "model", "t.json")
     assert result.exit_code == 0
     assert "not in" in result.stderr

@@ -44,7 +44,7 @@ def _files(kind: str) -> dict[str, bytes]:
             views = [View(n, n, c) for n, c in zip(model.names, model.cameras, strict=True)]
             nerfstudio.write(folder / "transforms.json", views, folder)
         else:
-            colmap.write_colmap_model(folder, model)
+            model.write(folder)
         if kind == "txt":
             import pycolmap
 
@@ -82,7 +82,7 @@ def _points(text: bool) -> bytes:
         path = Path(name) / "transforms.json"
         model = example()
         views = [View(n, n, c) for n, c in zip(model.names, model.cameras, strict=True)]
-        nerfstudio.write(path, views, path.parent, model.points, model.colours)
+        nerfstudio.write(path, views, path.parent, model.cloud.points, model.cloud.colours)
         data = PlyData.read(str(path.with_suffix(".ply")))
         data.text = text
         out = io.BytesIO()
@@ -99,7 +99,7 @@ def _points_layer(text: bool) -> Layer:
         beside=lambda: {"transforms.json": naming},
         text=True,
         read=_read_points,
-        holds=len(example().points),
+        holds=len(example().cloud.points),
     )
 
 
@@ -118,10 +118,10 @@ def _picture() -> Layer:
 
 
 def _read_model(path: Path) -> int:
-    found, model = colmap.read_model(path.parent)
-    assert len(model.points) <= _MOST
-    assert len(model.observed_px) <= _MOST
-    assert np.isfinite(model.points).all()
+    found, cloud, observations = colmap.read_model(path.parent)
+    assert len(cloud.points) <= _MOST
+    assert len(observations.px) <= _MOST
+    assert np.isfinite(cloud.points).all()
     return _checked([view.camera for view in found.views])
 
 

@@ -25,7 +25,7 @@ from stages.photos.load import load_depth
 from stages.photos.sources import DepthFile
 from stages.run.pipeline import Pipeline
 from stages.scene import Camera, Capture
-from stages.structure.undistorted_images import depth_file, write_undistorted_images
+from stages.structure.undistorted_images import PosedPhoto, depth_file, write_undistorted_images
 from tests.photos.made_files import exif, folder_of, save, textured
 
 WIDE, HIGH = 48, 32  # of the maps; the photographs have 96 x 64
@@ -277,9 +277,8 @@ def test_undistortion_moves_depth_to_where_the_lens_shows_it(photos: Path) -> No
     write_map(photos / "depth" / "IMG_1.npy", floor.astype(np.float32))
     capture, _ = taken(photos)
     report = Report()
-    made = write_undistorted_images(
-        capture.photos[:1], [camera], [lens], capture.folder, photos.parent, report
-    )
+    posed = [PosedPhoto(capture.photos[0], camera, lens)]
+    made = write_undistorted_images(posed, capture.folder, photos.parent, report)
     pinhole = made[0][0]
     depth = load_depth(photos.parent / depth_file(capture.photos[0]))
     scale = depth.shape[0] / pinhole.height

@@ -13,8 +13,9 @@ def job(folder: Path) -> Job:
         images_root=str(folder),
         database=str(folder / "a.db"),
         out="",
-        progress="",
         names=("é 1.jpg",),
         camera_of=(0,),
+        frame_of=(0,),
         cameras=(CameraGuess(640, 480, None),),
+        masks=("",),
     )

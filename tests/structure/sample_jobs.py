@@ -24,10 +24,11 @@ def sample_job(folder: Path, photographs: int) -> Job:
         images_root=str(folder),
         database=str(folder / "base.db"),
         out="",
-        progress=str(folder / "progress.json"),
         names=tuple(names),
         camera_of=(0,) * len(names),
+        frame_of=tuple(range(len(names))),
         cameras=(CameraGuess(640, 480, None),),
+        masks=("",) * len(names),
         max_features=800,
     )
 

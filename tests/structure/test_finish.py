@@ -42,7 +42,8 @@ def test_a_photograph_has_one_name_in_every_folder(tmp_path: Path) -> None:
     assert of_ingest["photo.heic"] == "photo-2.jpg"
     assert of_ingest["r_0.png"] == "r_0.png"
     assert {v.name: v.image.removeprefix("colmap/images/") for v in found.views} == of_ingest
-    assert set(read_model(folder / "colmap" / "sparse" / "0")[1].names) == set(of_ingest.values())
+    views = read_model(folder / "colmap" / "sparse" / "0")[0].views
+    assert {view.name for view in views} == set(of_ingest.values())
     images = folder / "colmap" / "images"
     written = {p.relative_to(images).as_posix() for p in images.rglob("*") if p.is_file()}
     assert written == set(of_ingest.values())

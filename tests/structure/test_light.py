@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from stages.base.stage import Report
+from stages.cameras.colmap import Observations
 from stages.measure.evaluation import EvaluationView, load_evaluation_view
 from stages.scene import TRANSPARENT, Camera, View
 from stages.scene.light import BRIGHT, LEAST_EXPLAINED, NOISE_EV, powers_of_radius, spread_ev
@@ -106,11 +106,8 @@ def test_light_is_stored_although_it_explains_little(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     files, _, *observed = photographs(tmp_path, np.zeros((VIEWS, 3)), hidden=0.0, shiny=True)
-    observed_points, observing_views, observed_px = observed
-    model = SimpleNamespace(
-        observed_points=observed_points, observing_views=observing_views, observed_px=observed_px
-    )
-    monkeypatch.setattr(light_module, "read_model", lambda folder: (None, model))
+    read = None, None, Observations(*observed)
+    monkeypatch.setattr(light_module, "read_model", lambda folder: read)
     whole = small_scene(tmp_path, VIEWS).reconstruction
     views = tuple(
         replace(view, image=file.name) for view, file in zip(whole.views, files, strict=True)

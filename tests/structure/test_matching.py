@@ -29,12 +29,10 @@ def features(tmp_path_factory: pytest.TempPathFactory) -> Job:
 def matching(features: Job, folder: Path, how: str, threads: int = 2) -> Job:
     database = folder / "base.db"
     sqlite.copy(Path(features.database), database)
-    progress = str(folder / "progress.json")
     return replace(
         features,
         step="matching",
         database=str(database),
-        progress=progress,
         matching=how,
         threads=threads,
     )
@@ -61,7 +59,7 @@ def test_three_threads_find_what_one_finds(
     jobs.work(job)
     assert (found(job, "matches"), found(job, "two_view_geometries")) == whole
     assert len(whole[0]) == len(exhaustive_pairs(PHOTOGRAPHS))
-    assert read_progress(Path(job.progress)) == ("matching", 36, 36)
+    assert read_progress(job) == ("matching", 36, 36)
 
 
 @pytest.mark.slow

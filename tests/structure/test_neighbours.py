@@ -29,7 +29,7 @@ def faces(photographs: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def test_faces_of_one_photograph_are_not_matched() -> None:
     for photographs in (3, 12):
         poses, turns, numbers = faces(photographs)
-        found = neighbours(poses, turns, numbers)
+        found = np.array(neighbours(poses, turns, numbers))
         assert (found[:, 0] < found[:, 1]).all()
         assert (numbers[found[:, 0]] != numbers[found[:, 1]]).all()
         assert len(np.unique(found, axis=0)) == len(found)
@@ -38,7 +38,7 @@ def test_faces_of_one_photograph_are_not_matched() -> None:
 def test_the_same_faces_of_photographs_next_in_order_are_matched_whatever_the_poses() -> None:
     poses, turns, numbers = faces(12)
     wrong = poses[np.random.default_rng(0).permutation(len(poses))]
-    found = {tuple(pair) for pair in neighbours(wrong, turns, numbers).tolist()}
+    found = set(neighbours(wrong, turns, numbers))
     for photograph in range(11):
         for face in range(5):
             assert (5 * photograph + face, 5 * photograph + 5 + face) in found

@@ -16,6 +16,7 @@ from stages.scene.rotations import matrices_of
 from stages.structure.pinhole_views import PinholeView, write_pinhole_views
 from stages.structure.undistorted_images import (
     IMAGES,
+    PosedPhoto,
     depth_file,
     mask_file,
     write_undistorted_images,
@@ -40,7 +41,7 @@ def written(
     folder: Path, photo: Photo, taken: Camera, lens: Lens
 ) -> tuple[list[PinholeView], Report]:
     report = Report()
-    views = write_pinhole_views([photo], [taken], [lens], folder, folder / "sfm", report)
+    views = write_pinhole_views([PosedPhoto(photo, taken, lens)], folder, folder / "sfm", report)
     return views, report
 
 
@@ -103,8 +104,8 @@ def test_an_ordinary_fisheye_keeps_the_bytes_of_one_pinhole_picture(tmp_path: Pa
     photo = photograph(tmp_path, "a.png", coded(shown(taken, LENS)))
     (view,), _ = written(tmp_path, photo, taken, LENS)
     assert view.photo == photo
-    more = [photo], [taken], [LENS], tmp_path, tmp_path / "plain", Report()
-    (pinhole,), _ = write_undistorted_images(*more)
+    posed = [PosedPhoto(photo, taken, LENS)]
+    (pinhole,), _ = write_undistorted_images(posed, tmp_path, tmp_path / "plain", Report())
     assert (view.camera.width, view.camera.cx) == (pinhole.width, pinhole.cx)
     here, there = (tmp_path / name / IMAGES / "a.png" for name in ("sfm", "plain"))
     assert here.read_bytes() == there.read_bytes()
