@@ -11,11 +11,11 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 from stages.base.bad_files import reading, stage_output
 from stages.base.errors import Interrupted, QualityError, SplatError
-from stages.base.lazy import load_object
 from stages.base.settings import setting
 from stages.base.stage import Report, Stage
 from stages.base.text import counted
@@ -151,7 +151,7 @@ def _write_meshes(
     files = []
     for row in rows:
         path = folder / f"{settings.name}.{row.ending}"
-        load_object(row.writer)(path, made.mesh, reconstruction.units)
+        resolve_name(row.writer)(path, made.mesh, reconstruction.units)
         if fault := fault_of(path, row, made.mesh):
             raise _failed(path, fault, "mesh")
         files.append(ExportedFile(row.ending, path.name, path.stat().st_size))

@@ -9,6 +9,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from pkgutil import resolve_name
 
 import typer
 
@@ -16,7 +17,6 @@ from splatcli import console
 from stages.base import threads
 from stages.base.distribution import NAME, VERSION, install_command
 from stages.base.errors import Family
-from stages.base.lazy import load_object
 from stages.base.libraries import modules_of, needed, versions
 from stages.base.memory import available_mib
 from stages.base.text import counted, reason_of
@@ -151,7 +151,7 @@ def _backend(backend: Backend) -> Check:
     try:
         if why := backend.why_unavailable():
             return Check(label, f"not chosen: {why}", advice=_BACKEND_ADVICE)
-        load_object(backend.rasteriser)
+        resolve_name(backend.rasteriser)
     except Exception as error:
         return Check(label, f"not present ({reason_of(error)})", ok=False)
     return Check(label, "present")

@@ -7,9 +7,9 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
+from pkgutil import resolve_name
 
 from stages import formats
-from stages.base.lazy import load_object
 from stages.formats.axes import smallest_rotations
 from stages.formats.quantisation import BitDepths, palette_bits, quantise_attribute, quantise_splats
 from stages.formats.table import Format
@@ -88,7 +88,7 @@ def file_size_bytes(
 ) -> int:
     """The size of `splats` as a file of the format, found by writing it. depths: see `choose_bits`;
     empty for formats without a quantiser."""
-    held = load_object(row.quantiser)(splats, BitDepths(**depths)) if depths else splats
+    held = resolve_name(row.quantiser)(splats, BitDepths(**depths)) if depths else splats
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / row.file_name("scene")
         formats.write(path, held, units=units, views=views)

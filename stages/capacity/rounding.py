@@ -14,12 +14,12 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from pkgutil import resolve_name
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stages import formats
-from stages.base.lazy import load_object
 from stages.formats.table import Format
 from stages.scene import Splats
 from stages.training.finetune import FineTuner
@@ -61,7 +61,7 @@ def write_and_read(row: Format, splats: Splats) -> Splats:
         formats.write(path, splats)
         found = formats.read(path).with_sh_degree(splats.sh_degree)
     if row.order:
-        found = found.take(np.argsort(load_object(row.order)(splats)))
+        found = found.take(np.argsort(resolve_name(row.order)(splats)))
     drawn = replace(splats.draw_settings, antialias=found.draw_settings.antialias)
     return replace(found, draw_settings=drawn, origin=splats.origin)
 

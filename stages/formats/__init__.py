@@ -23,11 +23,11 @@ import re
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 from stages.base.atomic import remove_abandoned_files
 from stages.base.bad_files import reading
-from stages.base.lazy import load_object
 from stages.formats.table import BY_ENDING, FORMATS, Format, format_of
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ def write(
     if row.streamed:
         more["coarser"] = coarser
     splats, dropped = drop_undrawable(splats)
-    load_object(row.writer)(Path(path), splats, units=units, **more)
+    resolve_name(row.writer)(Path(path), splats, units=units, **more)
     if not row.holds_origin:
         write_offset(Path(path), row, splats, units)
     return dropped
@@ -95,7 +95,7 @@ def read(path: Path, *, strict: bool = True) -> Splats:
 
     path, row = Path(path), format_of(path)
     with nullcontext() if strict else nonfinite_allowed(), reading(path):
-        splats: Splats = check_finite(load_object(row.reader)(path))
+        splats: Splats = check_finite(resolve_name(row.reader)(path))
     if row.holds_origin or not offset_path(path).exists():
         return splats
     with reading(offset_path(path)):

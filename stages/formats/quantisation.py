@@ -7,11 +7,11 @@ writer and its readers stay unchanged.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
+from pkgutil import resolve_name
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.lazy import load_object
 from stages.formats import codebook, smallest_three
 from stages.formats.axes import smallest_rotations
 from stages.formats.sog import (
@@ -100,7 +100,7 @@ def splats_to_write(row: Format, quantised: QuantisedSplats) -> Splats:
     bits = quantised.decisions.get("bits")
     if not row.quantiser or not isinstance(bits, dict):
         return splats
-    found: Splats = load_object(row.quantiser)(splats, BitDepths(**bits))
+    found: Splats = resolve_name(row.quantiser)(splats, BitDepths(**bits))
     return found
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from pkgutil import resolve_name
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.lazy import load_object
 from stages.formats import BY_ENDING, Format
 from stages.proof.content import FileContent, arrays_by_rows
 from stages.proof.matching import Rows, extent_of, matched_rows
@@ -90,7 +90,7 @@ def _orders(truth: Splats, file: Splats, formats: list[Format]) -> Iterator[Rows
     often fits."""
     for row in formats:
         if row.order:
-            order = load_object(row.order)
+            order = resolve_name(row.order)
             yield order(truth)
             yield np.argsort(order(file))
 

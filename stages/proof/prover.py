@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,6 @@ from numpy.typing import NDArray
 
 from stages.base.blocks import blocks
 from stages.base.errors import QualityError
-from stages.base.lazy import load_object
 from stages.base.text import counted, reason_of
 from stages.formats import BY_ENDING, Format, format_of
 from stages.formats.compressed_ply import outlier_shells
@@ -250,7 +250,7 @@ def losses_shown(row: Format, proof: Proof, splats: Splats) -> str:
 
 def _cause(row: Format, splats: Splats, moved: bool) -> str:
     """moved: whether positions differ by more than the distance between neighbours."""
-    if moved and row.position_loss and (loss := load_object(row.position_loss)(splats)):
+    if moved and row.position_loss and (loss := resolve_name(row.position_loss)(splats)):
         return f"it {loss}. {_DROP}."
     if moved and (count := int(np.count_nonzero(outlier_shells(splats.means)))):
         return f"{counted(count, 'outlier')} widened the range of its positions. {_DROP}."

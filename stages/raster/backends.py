@@ -11,10 +11,10 @@ A backend may run on several torch devices. Its full name then has the device af
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 from stages.base.errors import SplatError, UsageError
-from stages.base.lazy import load_object
 from stages.base.settings import setting
 from stages.raster.torch_device import CPU, DEVICES
 
@@ -54,11 +54,11 @@ class Backend:
 
     def describe(self) -> str:
         """The hardware that it runs on, for a manifest. Raises SplatError where it is absent."""
-        return str(load_object(self.description)(*self._device())) if self.description else CPU
+        return str(resolve_name(self.description)(*self._device())) if self.description else CPU
 
     def create(self) -> Rasteriser:
         """A new rasteriser. Raises SplatError if the hardware that it needs is absent."""
-        rasteriser: Rasteriser = load_object(self.rasteriser)(*self._device())
+        rasteriser: Rasteriser = resolve_name(self.rasteriser)(*self._device())
         return rasteriser
 
     def require(self) -> None:
@@ -69,7 +69,7 @@ class Backend:
 
     def why_unavailable(self) -> str:
         """Why "auto" does not choose it on this machine; "" if it may."""
-        return str(load_object(self.availability)()) if self.availability else ""
+        return str(resolve_name(self.availability)()) if self.availability else ""
 
     def _device(self) -> tuple[str, ...]:
         return (self.device,) if self.devices else ()

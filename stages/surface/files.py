@@ -7,13 +7,13 @@ both coincide. .glb: the same, y up. Specification: glTF 2.0, 3.7.
 from __future__ import annotations
 
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
-from stages.base.lazy import load_object
 from stages.formats.gltf_file import Attribute, asset, buffer_fields, write_glb
 from stages.formats.ply_header import header_text
 from stages.scene.flip import FLIP, flipped_place
@@ -32,7 +32,7 @@ def fault_of(path: Path, row: MeshFormat, mesh: Mesh) -> str:
     """What is wrong with a file that should hold `mesh`, as the independent reader finds it; "" if
     nothing is."""
     try:
-        vertices, faces = load_object(row.independent_reader)(path)
+        vertices, faces = resolve_name(row.independent_reader)(path)
     except Exception as error:  # whatever the reader raises: the file is wrong
         return f"another reader refused it ({error})"
     if len(vertices) != len(mesh.vertices) or len(faces) != len(mesh.faces):

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pkgutil import resolve_name
 from typing import Protocol, SupportsInt
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.lazy import load_object
 from stages.raster.backends import backend_of
 from stages.raster.definition import Arrays, Backward, Rasteriser, RasterSettings
 from stages.scene import Camera
@@ -79,7 +79,7 @@ def step_of(backend: str) -> TrainingStep:
     """A new training step of the backend `backend` or "auto". Raises ValueError for an unknown
     name, SplatError if the hardware that it needs is absent."""
     chosen = backend_of(backend)
-    step_class = load_object(_OWN_STEPS.get(chosen.name, _OTHER_BACKENDS))
+    step_class = resolve_name(_OWN_STEPS.get(chosen.name, _OTHER_BACKENDS))
     step: TrainingStep = step_class(chosen.create())
     return step
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import inspect
 from dataclasses import replace
 from pathlib import Path
+from pkgutil import resolve_name
 
 import numpy as np
 import pytest
 
 from stages import formats
 from stages.base.errors import Family, SplatError
-from stages.base.lazy import load_object
 from stages.formats import BY_ENDING, FORMATS, Format
 from stages.proof.checks import CHECKS, byte_breakdown_of
 from stages.surface.table import MESHES, MeshFormat
@@ -25,7 +25,7 @@ ROWS: list[Format | MeshFormat] = [*BY_ENDING.values(), *MESHES.values()]
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row.ending)
 def test_every_function_that_a_row_names_exists(row: Format | MeshFormat) -> None:
     for place in filter(None, (getattr(row, name, "") for name in PLACES)):
-        assert callable(load_object(place)), place
+        assert callable(resolve_name(place)), place
 
 
 def test_every_format_has_its_checks() -> None:
@@ -34,7 +34,7 @@ def test_every_format_has_its_checks() -> None:
 
 @pytest.mark.parametrize("row", FORMATS.values(), ids=lambda row: row.ending)
 def test_a_writer_takes_views_where_its_row_says_so(row: Format) -> None:
-    assert ("views" in inspect.signature(load_object(row.writer)).parameters) == row.takes_views
+    assert ("views" in inspect.signature(resolve_name(row.writer)).parameters) == row.takes_views
 
 
 @pytest.mark.parametrize("row", FORMATS.values(), ids=lambda row: row.ending)
@@ -42,7 +42,7 @@ def test_rows_of_a_file_are_in_the_order_of_the_table(tmp_path: Path, row: Forma
     splats = many_splats(200)
     path = tmp_path / f"a.{row.ending}"
     formats.write(path, splats)
-    order = load_object(row.order)(splats) if row.order else np.arange(200)
+    order = resolve_name(row.order)(splats) if row.order else np.arange(200)
     back = read(path)
     np.testing.assert_allclose(back.means, splats.means[order], atol=0.02)
     assert back.sh_degree == row.sh_degree
@@ -53,7 +53,7 @@ def test_formats_lose_what_their_rows_declare_and_nothing_else(tmp_path: Path, r
     splats = many_splats(200)
     path = tmp_path / f"a.{row.ending}"
     formats.write(path, splats)
-    order = load_object(row.order)(splats) if row.order else np.arange(200)
+    order = resolve_name(row.order)(splats) if row.order else np.arange(200)
     back, wanted = read(path).with_sh_degree(3), splats.take(order)
     pairs = [(getattr(back, n), getattr(wanted, n)) for n in ("means", "sh", "opacities")]
     same = all(np.allclose(a, b, atol=1e-6) for a, b in pairs)

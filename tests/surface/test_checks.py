@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,6 @@ from pygltflib import GLTF2
 
 from stages import formats
 from stages.base.errors import SplatError
-from stages.base.lazy import load_object
 from stages.surface.files import fault_of
 from stages.surface.mesh import Mesh
 from stages.surface.table import MESHES
@@ -32,7 +32,7 @@ def tent() -> Mesh:
 def write(path: Path, mesh: Mesh, units: str = "metres") -> str:
     """Write by the table; what the independent reader has to say of it."""
     row = MESHES[path.name.removeprefix("a.")]
-    load_object(row.writer)(path, mesh, units)
+    resolve_name(row.writer)(path, mesh, units)
     return fault_of(path, row, mesh)
 
 
