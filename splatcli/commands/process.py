@@ -39,7 +39,7 @@ def process(
     base = run_settings.defaults() if photos is not None else pipeline.recorded_settings()
     settings = run_settings.combined(base, given, preset)
     if "cameras" in given:
-        _check_cameras(given["cameras"])
+        _check_cameras(settings["sfm"])
     if photos is None and console.mode.has_notes:
         console.note(run_settings.training_summary(settings["train"], given, preset))
     _run(pipeline, settings, view=view)
@@ -78,11 +78,13 @@ def _run_folder_and_photos(photos: Path | None, out: Path | None) -> tuple[Path,
     return out or DEFAULT, photos
 
 
-def _check_cameras(path: Path) -> None:
-    """Raises SplatError for a camera file that cannot be read, before the photographs are."""
+def _check_cameras(wanted: Any) -> None:
+    """wanted: settings of sfm. Raises SplatError for a camera file that cannot be read, and for one
+    without the split that is wanted, before the photographs are read."""
     from stages.cameras.table import read_cameras
+    from stages.structure.match_cameras import check_split
 
-    read_cameras(path)
+    check_split(read_cameras(wanted.cameras), wanted.split)
 
 
 def _run_stage(name: str, pipeline: Pipeline, given: Mapping[str, Any]) -> None:
