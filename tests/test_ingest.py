@@ -256,15 +256,20 @@ def test_hidden_files_and_other_files_are_passed_over(photos: Path) -> None:
     assert set(warnings) == {"ingest-few-photographs", "ingest-small"}
 
 
-def test_pictures_beside_the_frames_of_a_scan_are_named(photos: Path) -> None:
+def test_pictures_beside_the_frames_of_a_scan_are_named_except_its_thumbnail(photos: Path) -> None:
     for number, photograph in enumerate(sorted(photos.iterdir())):
         photograph.rename(photos / f"frame_0000{number}.jpg")
         (photos / f"frame_0000{number}.json").write_text("{}")
-    save(photos / "thumb_00000.jpg", textured(1))
+    save(photos / "textured_output.jpg", textured(1))
     capture, warnings, report = ingested(photos)
     assert len(capture.photos) == 3
-    assert "thumb_00000.jpg" in warnings["ingest-beside-frames"]
+    assert "textured_output.jpg" in warnings["ingest-beside-frames"]
     assert report.metrics["files_ignored"] == 3
+    (photos / "textured_output.jpg").rename(photos / "thumb_00000.jpg")  # every scan has one
+    capture, warnings, report = ingested(photos)
+    assert len(capture.photos) == 3
+    assert "ingest-beside-frames" not in warnings
+    assert report.metrics["files_ignored"] == 4
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "webp", "heic"])

@@ -34,6 +34,7 @@ def process(
     Finished work is kept: after an interruption the same command goes on where it stopped.
     """
     from stages.cameras.table import read_cameras
+    from stages.structure.match_cameras import check_split
 
     run_folder, photos = _run_folder_and_photos(photos, out)
     pipeline = distribute(Pipeline(run_folder, photos), cluster)
@@ -41,8 +42,9 @@ def process(
     view, preset = given.pop("view", False), given.pop("preset", None)
     base = run_settings.defaults() if photos is not None else pipeline.recorded_settings()
     settings = run_settings.combined(base, given, preset)
-    if "cameras" in given:  # an error now, before the photographs are read
-        read_cameras(given["cameras"])
+    if "cameras" in given:  # errors of the file now, before the photographs are read
+        sfm = settings["sfm"]
+        check_split(read_cameras(sfm.cameras), sfm.split)
     if photos is None and console.mode.has_notes:
         console.note(run_settings.training_summary(settings["train"], given, preset))
     _run(pipeline, settings, view=view)

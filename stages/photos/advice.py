@@ -15,7 +15,7 @@ from stages.scene import Photo
 
 Warn = Callable[[str, str], None]
 
-FEWEST_WITHOUT_WARNING = 20
+FEWEST_WITHOUT_WARNING, FEWEST_PANORAMAS = 20, 12
 BLURRED_BELOW = 0.6  # of the capture's median; a blur of 1.5 px at 1600 px gives about 0.55
 SOFT_BELOW = 2.5  # median sharpness; of pictures enlarged four times or blurred by 3 px it is less
 EV_RANGE_STOPS = 1.0
@@ -97,7 +97,8 @@ def about_capture(
     photos: Sequence[Photo], duplicates: Sequence[tuple[int, ...]], warn: Warn
 ) -> list[str]:
     """Warns about the capture as a whole; returns the names of blurred photographs."""
-    if len(photos) < FEWEST_WITHOUT_WARNING:
+    panoramas = sum(photo.face is not None for photo in photos)
+    if len(photos) < FEWEST_WITHOUT_WARNING and panoramas < FEWEST_PANORAMAS:
         warn(
             "ingest-few-photographs",
             f"The capture holds {counted(len(photos), 'usable photograph')}. An object or a room "

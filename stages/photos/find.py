@@ -29,6 +29,7 @@ from stages.photos.sources import (
 from stages.scene.capture import PHOTOS_FOLDER
 
 _FRAME = re.compile(r"(^|/)frame_[0-9]+\.json$")  # of 3D Scanner App
+_SMALL_COPY = re.compile(r"(^|/)thumb_[0-9]+\.jpg$")  # of a frame, in every scan of 3D Scanner App
 
 
 def find(folder: Path, more_masks: Path | None = None, depth: Path | None = None) -> Findings:
@@ -55,7 +56,8 @@ def find(folder: Path, more_masks: Path | None = None, depth: Path | None = None
     names = sorted(files, key=natural_key)
     pictures = [name for name in names if suffix_of(name) in PICTURES]
     in_scans = _without_pictures_of_scans(files, pictures)
-    beside_frames = tuple(name for name in pictures if name not in set(in_scans))
+    not_in_scans = (name for name in pictures if name not in set(in_scans))
+    beside_frames = tuple(name for name in not_in_scans if not _SMALL_COPY.search(name))
     photographs = _posed(folder, in_scans)
     stems = {stem_of(name) for name in photographs}
     unpaired = [name for name in names if stem_of(name) not in stems]

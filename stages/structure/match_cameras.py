@@ -37,8 +37,7 @@ def match_cameras(
     camera. With `split`, a photograph that the split leaves out (a benchmark's depth map, for
     example) needs no camera.
     """
-    if split and not {view.role for view in found.views} >= {"train", "test"}:
-        raise _no_split()
+    check_split(found, split)
     wanted = [i for i, v in enumerate(found.views) if not split or v.role in ("train", "test")]
     views = [found.views[i] for i in wanted]
     matches, missing = _matched(views, capture.photos)
@@ -169,12 +168,14 @@ def _twice(first: str, second: str, photo: str) -> SplatError:
     )
 
 
-def _no_split() -> SplatError:
-    return UsageError(
-        "cameras-without-split",
-        given="--split is given, but the camera file does not say which photographs are for "
-        "training and which for testing.",
-        wanted="transforms_train.json and transforms_test.json, or a file with train_filenames "
-        "and test_filenames.",
-        hint="Leave --split away; then every eighth photograph is held out.",
-    )
+def check_split(found: CameraFile, split: bool) -> None:
+    """Raises SplatError "cameras-without-split" if a split is wanted that the file has not."""
+    if split and not {view.role for view in found.views} >= {"train", "test"}:
+        raise UsageError(
+            "cameras-without-split",
+            given="--split is given, but the camera file does not say which photographs are for "
+            "training and which for testing.",
+            wanted="transforms_train.json and transforms_test.json, or a file with "
+            "train_filenames and test_filenames.",
+            hint="Leave --split away; then every eighth photograph is held out.",
+        )

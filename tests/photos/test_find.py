@@ -111,8 +111,8 @@ def test_3d_scanner_app_s_other_pictures_are_no_photographs(tmp_path: Path) -> N
     (scan / "info.json").write_text("{}")
     found = find(scan)
     assert [one.name for one in found.sources] == ["frame_00000.jpg", "frame_00003.jpg"]
-    assert found.beside_frames == ("textured_output.jpg", "thumb_00000.jpg")
-    assert found.others == 7  # .json files
+    assert found.beside_frames == ("textured_output.jpg",)
+    assert found.others == 8  # .json files, and the small copy that every scan has
     both = [one.name for one in find(tmp_path).sources]
     assert both == ["more/a.jpg", "scan/frame_00000.jpg", "scan/frame_00003.jpg"]
 

@@ -34,6 +34,17 @@ def test_a_picture_of_the_whole_sphere_is_a_panorama(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
+def test_a_rough_seam_and_poles_that_are_no_single_point_leave_it_a_panorama(seed: int) -> None:
+    """As stitching leaves them: brighter on one side, and something else filled in at the poles."""
+    gain = np.linspace(0.97, 1.03, 512)[None, :, None]
+    pixels = np.clip(128 + gain * (sphere(seed) - 128.0), 0, 255)
+    waves = 0.4 * np.sqrt(2) * np.median(pixels.mean(axis=2).std(axis=1))
+    pixels[[0, 1, -2, -1]] += waves * np.sin(np.arange(512) / 20)[None, :, None]
+    stitched = np.clip(pixels, 0, 255).astype(np.uint8)
+    assert panorama(stitched, size(stitched), "") == SPHERE
+
+
+@pytest.mark.parametrize("seed", range(5))
 def test_half_a_sphere_and_other_ratios_are_none(seed: int) -> None:
     pixels = sphere(seed, 1024)
     half = pixels[128:384, :512]

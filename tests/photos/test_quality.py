@@ -14,6 +14,7 @@ from stages.photos.advice import about_capture
 from stages.photos.load import load_image
 from stages.photos.quality import measure, near_duplicates
 from stages.scene import Photo
+from stages.scene.capture import Face
 from tests.photos.made_files import textured
 
 SAMPLE = Path(__file__).parents[2] / "sample_captures/still_life/images/IMG_0012.jpg"
@@ -113,6 +114,12 @@ def test_too_few_and_near_duplicates_are_reported() -> None:
     warnings = codes([photo(i) for i in range(5)], [(0, 2, 3)])
     assert set(warnings) == {"ingest-few-photographs", "ingest-near-duplicates"}
     assert "2 of 5" in warnings["ingest-near-duplicates"]
+
+
+def test_twelve_panoramas_are_enough_for_a_room() -> None:
+    face = Face("rig", "a.jpg", (1.0, 0.0, 0.0, 0.0))
+    assert codes([photo(i, face=face) for i in range(12)]) == {}
+    assert set(codes([photo(i, face=face) for i in range(11)])) == {"ingest-few-photographs"}
 
 
 def test_long_lists_of_names_are_cut() -> None:
