@@ -13,7 +13,6 @@ import pytest
 from splatcli import console
 from stages.base.distribution import NAME, VERSION
 from stages.base.errors import Interrupted, SplatError
-from stages.cameras.colmap import write_colmap_model
 from stages.raster import torch_device
 from stages.raster.gpu import device as gpu
 from stages.run.lock import locked
@@ -314,7 +313,7 @@ def test_cameras_that_cannot_be_read_are_refused_before_anything_is_made(splat) 
 
 
 def test_a_split_that_the_camera_file_has_not_is_refused_before_anything_is_made(splat) -> None:
-    write_colmap_model(Path("sparse/0"), example())
+    example().write(Path("sparse/0"))
     result = splat("process", "photos", "--cameras", "sparse/0", "--split")
     assert "cameras-without-split" in result.stderr
     assert result.exit_code == 2
