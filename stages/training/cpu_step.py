@@ -28,6 +28,8 @@ class CpuStep(HostStep):
         target = target_of(level, forward.image, settings.background)
         means = level.means if level.plain else None
         loss = image_loss(pool, forward.image, target, self._v_image, means=means)
+        if given.weight != 1.0:
+            self._v_image *= np.float32(given.weight)
         ignore_masked(level, self._v_image)
         backward = self.rasteriser.backward(forward, self._v_image)
         if given.use_gradients is not None:

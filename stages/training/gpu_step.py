@@ -198,6 +198,8 @@ class GpuStep:
                 self._room = max(self._room, int(SPARE * room))
             target, means = view_target.target(drawn.image, settings.background)
             loss, v_image = image_loss(drawn.image, target, means)
+            if given.weight != 1.0:
+                v_image *= given.weight
             view_target.ignore_masked(v_image)
             parameters, means2d = self.rasteriser.gradients(scene, view, drawn, v_image)
             if self._own is not None:

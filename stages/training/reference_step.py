@@ -50,7 +50,7 @@ class ReferenceStep(HostStep):
         forward = self.rasteriser.forward(self.arrays(given), level.camera, settings)
         image = torch.tensor(forward.image[:3], dtype=torch.float64, requires_grad=True)
         value = reference_loss(*compared(level, image, settings.background))
-        torch.autograd.backward(math.prod(size) * value)
+        torch.autograd.backward(given.weight * math.prod(size) * value)
         assert image.grad is not None
         v_image = image.grad.numpy().astype(np.float32)
         backward = self.rasteriser.backward(forward, v_image)

@@ -2,8 +2,9 @@
 
 The published schedule has 30,000 steps. Its events are scaled to the number of steps of the run,
 which may change during the run. Unlike the published one, it never resets opacities, draws at half
-the size in the first fifth, raises the learning rates of short runs, lets all of them decay, and
-bounds the number of splats by a budget that rises linearly. Steps count from 0.
+the size in the first fifth and at several sizes after densification, raises the learning rates of
+short runs, lets all of them decay, and bounds the number of splats by a budget that rises linearly.
+Steps count from 0.
 """
 
 from __future__ import annotations
@@ -26,8 +27,13 @@ LOG_SCALES_POWER = 0.8
 # Learning rates decay from this share of the run on, to this share of their value.
 RATE_DECAY_FROM, RATE_DECAY_END = 0.6, 0.1
 MIN_DENSIFY_INTERVAL = 50  # steps: fewer see too little of the scene
-# (share of the run, scale of the images): small images first, they are cheap and smooth
-RESOLUTIONS = ((0.2, 0.5), (1.0, 1.0))
+SCALES = (0.25, 0.5, 1.0)  # of the images' sides
+QUARTER, HALF, FULL = range(len(SCALES))
+HALF_SIZE_END = 0.2  # share of the run that draws small images: they are cheap and smooth
+# After densification, one of 20 steps draws at a quarter and two at half of the size, so that the
+# splats are right in small images, too.
+SMALLER_STEPS = {4: QUARTER, 9: HALF, 19: HALF}
+SMALLER_STEPS_PERIOD = 20
 
 
 @dataclass(frozen=True)
@@ -121,9 +127,17 @@ class Schedule:
         return self.share(step) >= 3000 / PUBLISHED_STEPS
 
     def level(self, step: int) -> int:
-        """Index into RESOLUTIONS."""
-        share = self.share(step)
-        return sum(share >= end for end, _ in RESOLUTIONS[:-1])
+        """Index into SCALES."""
+        if self.share(step) < HALF_SIZE_END:
+            return HALF
+        if self.densifying(step):
+            return FULL
+        return SMALLER_STEPS.get(step % SMALLER_STEPS_PERIOD, FULL)
+
+    def weight(self, step: int) -> float:
+        """Factor of the loss: the area of a pixel, in pixels of the full size (Barron et al. 2021,
+        "Mip-NeRF"). 1 while the model is densified, by gradients at the size that is drawn."""
+        return 1.0 if self.densifying(step) else SCALES[self.level(step)] ** -2
 
     def view(self, step: int, n_views: int) -> int:
         """Row of the training view of `step`: each of `n_views` once an epoch, in random order."""

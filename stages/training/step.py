@@ -37,6 +37,7 @@ class StepInput:
         dropout: drops splats from this step; None for none.
         use_gradients: is called with the model and its gradients before Adam changes the model;
             only steps on the host do this.
+        weight: factor of all gradients, not of the loss that a step returns.
     """
 
     level: Level
@@ -45,6 +46,7 @@ class StepInput:
     smooth: bool = False
     dropout: Dropout | None = None
     use_gradients: Callable[[Model, Backward], None] | None = None
+    weight: float = 1.0
 
 
 class TrainingStep(Protocol):

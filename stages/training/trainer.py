@@ -131,7 +131,8 @@ class Trainer:
         dropout = None
         if self.dropout and not schedule.densifying(step):  # it would distort the mean gradients
             dropout = Dropout(len(self.train), schedule.dropout_key(step))
-        given = StepInput(level, settings, rates, self.smooth, dropout, refine)
+        weight = schedule.weight(step)
+        given = StepInput(level, settings, rates, self.smooth, dropout, refine, weight)
         return self.stepper.step(given)
 
     def register_held_out(self) -> None:

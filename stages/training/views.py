@@ -22,7 +22,7 @@ from stages.photos.album import Album
 from stages.scene import IGNORE, TRANSPARENT, Camera, View
 from stages.scene.light import BRIGHT, Light, gains_and_offsets
 from stages.training.loss import channel_means
-from stages.training.schedule import RESOLUTIONS
+from stages.training.schedule import SCALES
 
 Colour = tuple[float, float, float]
 
@@ -67,7 +67,7 @@ class Level:
 
 
 class Levels(Protocol):
-    """A view at each of RESOLUTIONS; the last has the full size."""
+    """A view at each of SCALES; the last has the full size."""
 
     def __getitem__(self, level: int, /) -> Level: ...
 
@@ -130,8 +130,9 @@ def load_views(
     with Album(work) as album:
         for view in views:
             levels = _Stored(album)
-            for _, scale in RESOLUTIONS:
-                camera = view.camera.fitted(max(16, round(train_side * scale)))
+            full = view.camera.fitted(max(16, train_side))
+            for scale in SCALES:
+                camera = full.fitted(max(16, round(max(full.width, full.height) * scale)))
                 photograph = load_evaluation_view(folder, view, camera, vignetting)
                 masked = photograph.mask, view.outside
                 kept_light = view.light if light else None

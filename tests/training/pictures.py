@@ -6,7 +6,7 @@ import numpy as np
 
 from stages.scene import Camera
 from stages.training.loss import channel_means
-from stages.training.schedule import RESOLUTIONS
+from stages.training.schedule import SCALES
 from stages.training.views import Level, TrainingView
 
 
@@ -14,4 +14,4 @@ def view_of(name: str, picture: np.ndarray, where: Camera) -> TrainingView:
     """A training view of one picture [H, W, 3] at all levels (the same size)."""
     pixels = np.ascontiguousarray((picture * 255).round().astype(np.uint8).transpose(2, 0, 1))
     level = Level(where, pixels, channel_means(pixels))
-    return TrainingView(name, tuple(level for _ in RESOLUTIONS))
+    return TrainingView(name, tuple(level for _ in SCALES))

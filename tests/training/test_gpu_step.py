@@ -79,7 +79,8 @@ def test_masks_and_light_ask_what_the_definition_asks(outside, light):
     plain, found = ReferenceStep(ReferenceRasteriser()), stepper()
     plain.load(start())
     photograph = masked(outside, light)
-    losses = [s.step(StepInput(photograph, settings, RATES)) for s in (found, plain)]
+    given = StepInput(photograph, settings, RATES, weight=4.0)
+    losses = [s.step(given) for s in (found, plain)]
     assert losses[0] == pytest.approx(losses[1], rel=1e-5)
     wanted = plain.model().moment1
     np.testing.assert_allclose(found.model().moment1, wanted, atol=2e-5 * np.abs(wanted).max())

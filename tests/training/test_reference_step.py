@@ -39,7 +39,12 @@ def masked(level: Level, outside: str) -> Level:
 
 
 def stepped(
-    backend: str, steps: int, degree: int = 1, outside: str = "", light: Light | None = None
+    backend: str,
+    steps: int,
+    degree: int = 1,
+    outside: str = "",
+    light: Light | None = None,
+    weight: float = 1.0,
 ) -> tuple[Model, list[float]]:
     level = level_of(cloud(80, 40, 30, degree=1))
     if outside:
@@ -49,8 +54,17 @@ def stepped(
     stepper = step_of(backend)
     stepper.load(new_model(*(array.copy() for array in splat_arrays(start))))
     settings = RasterSettings(near=0.1, sh_degree=degree, background=(0.9, 0.2, 0.6))
-    losses = [stepper.step(StepInput(level, settings, RATES)) for _ in range(steps)]
+    given = StepInput(level, settings, RATES, weight=weight)
+    losses = [stepper.step(given) for _ in range(steps)]
     return stepper.model(), losses
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_the_weight_of_a_step_multiplies_its_gradients_and_not_its_loss(backend: str) -> None:
+    plain, loss = stepped(backend, 1)
+    weighted, same_loss = stepped(backend, 1, weight=4.0)
+    assert same_loss == loss
+    np.testing.assert_allclose(weighted.moment1, 4.0 * plain.moment1, rtol=1e-5)
 
 
 @pytest.mark.parametrize(("degree", "outside"), [(0, ""), (1, ""), (1, IGNORE), (1, TRANSPARENT)])

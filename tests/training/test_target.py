@@ -14,7 +14,7 @@ from stages.raster.draw import render
 from stages.scene import IGNORE, TRANSPARENT, DrawSettings, Splats
 from stages.training.loss import channel_means
 from stages.training.optimiser import LearningRates, new_model
-from stages.training.schedule import RESOLUTIONS, Schedule
+from stages.training.schedule import SCALES, Schedule
 from stages.training.step import StepInput, step_of
 from stages.training.trainer import Trainer
 from stages.training.views import Level, TrainingView
@@ -67,7 +67,7 @@ def trained(outside: str, folder: Path) -> Splats:
         opacities=0.6,
     )
     picture = render(red, WHERE).image.copy()
-    view = TrainingView("a", tuple(level(np.clip(picture, 0, 1), outside) for _ in RESOLUTIONS))
+    view = TrainingView("a", tuple(level(np.clip(picture, 0, 1), outside) for _ in SCALES))
     start = join(red, dark)
     schedule = Schedule(steps=800, extent=10.0, sh_degree=0, n_start=len(start), seed=0)
     draw_settings = DrawSettings(near=0.1)
@@ -99,7 +99,7 @@ def test_what_is_black_is_there_if_a_scene_is_for_any_background(
         opacities=0.4,
     )
     black = replace(level(np.zeros((48, 48, 3)), ""), mask=None)
-    view = TrainingView("a", tuple(black for _ in RESOLUTIONS))
+    view = TrainingView("a", tuple(black for _ in SCALES))
     schedule = Schedule(steps=150, extent=10.0, sh_degree=0, n_start=9, seed=0)
     draw_settings = DrawSettings(near=0.1)
     made = Trainer(

@@ -7,9 +7,11 @@ from stages.base.stage import Report
 from stages.train import TrainSettings
 from stages.training.build import make_trainer
 from stages.training.optimiser import LearningRates
-from stages.training.schedule import RATE_DECAY_END, RATES_POWER, RESOLUTIONS, Schedule
+from stages.training.schedule import RATE_DECAY_END, RATES_POWER, SCALES, Schedule
 from stages.training.time_limit import TimeLimit
 from tests.small_scene import small_scene
+
+PARTS = ((0, 600), (600, 1500), (1500, 3000))  # steps before, while and after the model grows
 
 
 def schedule(steps=3000):
@@ -88,8 +90,19 @@ def test_a_changed_plan_goes_on_from_where_the_run_is_and_ends_at_its_end():
     assert again == plan
 
 
-def test_pictures_are_whole_to_the_very_end_of_any_plan():
+def test_pictures_are_as_planned_to_the_very_end_of_any_plan():
     plan = schedule(1000)
     for step in range(10, 990, 7):
         plan = plan.replanned(step, 1000)
-    assert {plan.level(step) for step in range(990, 1001)} == {len(RESOLUTIONS) - 1}
+    assert [plan.level(s) for s in range(980, 1000)] == [schedule().level(s) for s in range(2980, 3000)]
+
+
+def test_after_densification_some_pictures_are_smaller_and_count_by_the_area_of_their_pixels():
+    plan = schedule()
+    scales = {part: [SCALES[plan.level(s)] for s in range(*part)] for part in PARTS}
+    assert set(scales[0, 600]) == {0.5}
+    assert set(scales[600, 1500]) == {1.0}
+    late = scales[1500, 3000]
+    assert (late.count(0.25), late.count(0.5), late.count(1.0)) == (75, 150, 1275)
+    assert {plan.weight(s) for s in range(1500)} == {1.0}
+    assert [plan.weight(s) for s in range(1500, 3000)] == [scale**-2 for scale in late]
