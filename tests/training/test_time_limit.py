@@ -94,7 +94,9 @@ def test_pictures_are_as_planned_to_the_very_end_of_any_plan():
     plan = schedule(1000)
     for step in range(10, 990, 7):
         plan = plan.replanned(step, 1000)
-    assert [plan.level(s) for s in range(980, 1000)] == [schedule().level(s) for s in range(2980, 3000)]
+    assert [plan.level(s) for s in range(980, 1000)] == [
+        schedule().level(s) for s in range(2980, 3000)
+    ]
 
 
 def test_after_densification_some_pictures_are_smaller_and_count_by_the_area_of_their_pixels():
