@@ -22,6 +22,7 @@ _CONTAINERS = (
 _COPY_OR_EXPORT = "Copy it from the camera again, or export it as H.264 or HEVC"
 _SMALLEST_SIDE_PX = 16
 _LARGEST_SIDE_PX = 16_384
+_HARDLY_ANY = 10  # damaged frames for each that decodes
 _LOST_SECONDS = 1.0  # at the end: less may be rounding of the container
 
 
@@ -88,7 +89,7 @@ class Video:
         self.missing_s = 0.0
 
     def frames(self) -> Iterator[Frame]:
-        """Every frame that decodes. Raises Unusable if there is none."""
+        """Every frame that decodes. Raises Unusable at the end if hardly any did."""
         self.decoded = self.damaged = 0
         with _opened(self.path) as container:
             stream = _video_stream(container)
@@ -104,9 +105,9 @@ class Video:
                 yield Frame(self.decoded, last, picture, colours, aspect)
                 self.decoded += 1
             whole = float(stream.duration * stream.time_base) if stream.duration else 0.0
-        if not self.decoded:
+        if _HARDLY_ANY * self.decoded <= self.damaged:  # encrypted frames may decode by chance
             raise Unusable(
-                "none of its frames decodes: it is encrypted, or damaged"
+                "hardly any of its frames decodes: it is encrypted, or damaged"
                 if self.damaged
                 else "it holds no frames",
                 _COPY_OR_EXPORT,

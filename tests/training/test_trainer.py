@@ -27,7 +27,7 @@ from stages.training.density import AdaptiveDensity
 from stages.training.hooks import EVALUATIONS
 from stages.training.loss import image_loss
 from stages.training.optimiser import LearningRates, apply_gradients, new_model
-from stages.training.schedule import Schedule
+from stages.training.schedule import SCALES, Schedule
 from stages.training.trainer import Trainer
 from stages.training.views import Level, TrainingView, load_views
 from tests.scenes import camera, cloud, splats
@@ -484,7 +484,7 @@ def test_pictures_on_disk_train_to_the_same_bytes_as_pictures_in_memory(tmp_path
             view.name,
             tuple(
                 Level(one.camera, one.pixels.copy(), one.means)
-                for one in map(view.levels.__getitem__, (0, 1))
+                for one in map(view.levels.__getitem__, range(len(SCALES)))
             ),
         )
         for view in stored
