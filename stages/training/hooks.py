@@ -16,7 +16,12 @@ from stages.measure.evaluation import EvaluationView, evaluate, evaluation_subse
 from stages.raster.backends import backend_of, rasteriser_of
 from stages.scene import Camera, Splats, morton
 from stages.training.colour_refit import ColourRefit, needs_colour_refit
-from stages.training.density import AdaptiveDensity, BoundedDensity, DensityRule
+from stages.training.density import (
+    AdaptiveDensity,
+    BoundedDensity,
+    DensityRule,
+    gradient_threshold,
+)
 from stages.training.free_space import FreeSpace, known_free_space
 from stages.training.optimiser import empty_model
 from stages.training.sparsification import Sparsification
@@ -39,7 +44,9 @@ class StepHook(Protocol):
 
 def step_hooks(trainer: Trainer, start: Splats) -> list[StepHook]:
     """All hooks of a run that starts from `start`, in the order in which they are called."""
-    adaptive = AdaptiveDensity(trainer.schedule.extent, len(trainer.train))
+    schedule = trainer.schedule
+    threshold = gradient_threshold(schedule.steps)
+    adaptive = AdaptiveDensity(schedule.extent, len(trainer.train), threshold)
     density: DensityRule = BoundedDensity(adaptive, trainer.within) if trainer.within else adaptive
     # Of very many held-out views a part is evaluated, so that it takes less time than training.
     views = [trainer.held_out[i] for i in evaluation_subset(len(trainer.held_out))]

@@ -10,7 +10,9 @@ from stages.training.density import (
     CHILD_OFFSET,
     CHILD_OPACITY,
     CHILD_WIDTH,
+    GRADIENT_THRESHOLD,
     AdaptiveDensity,
+    gradient_threshold,
     split_along_longest_axis,
 )
 from stages.training.optimiser import LearningRates, new_model
@@ -109,6 +111,11 @@ def test_splats_that_one_view_sees_are_densified_last_even_with_larger_gradients
     np.testing.assert_allclose(centres_of_parents(grow(m, cap=4), 1), m.means[2:], atol=1e-6)
     np.testing.assert_allclose(centres_of_parents(grow(m, cap=5), 2), m.means[1:], atol=1e-6)
     assert len(grow(m)) == 6  # while there is room, all do
+
+
+def test_the_threshold_is_the_published_one_and_falls_with_the_root_of_a_long_runs_steps():
+    assert {gradient_threshold(steps) for steps in (1, 2000, 7000)} == {GRADIENT_THRESHOLD}
+    assert gradient_threshold(28_000) == pytest.approx(GRADIENT_THRESHOLD / 2)
 
 
 def test_the_cap_takes_half_of_the_free_memory():
