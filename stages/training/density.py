@@ -9,6 +9,7 @@ what a split breaks.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -37,7 +38,7 @@ def gradient_threshold(steps: int) -> float:
     """The threshold of a run of `steps`. It falls as 1 / sqrt(steps) in long ones: otherwise 30,000
     steps grow fewer splats than 7,000, and end with a lower PSNR
     (docs/experiments/densification.md)."""
-    return GRADIENT_THRESHOLD * min(1.0, LONG_RUN / steps) ** 0.5
+    return GRADIENT_THRESHOLD * math.sqrt(min(1.0, LONG_RUN / steps))
 
 
 class DensityRule(Protocol):
