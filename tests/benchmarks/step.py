@@ -22,7 +22,7 @@ from stages.raster.kernels.pool import Pool
 from stages.scene import Camera, DrawSettings, Splats
 from stages.training.loss import channel_means
 from stages.training.optimiser import Model, new_model
-from stages.training.schedule import Schedule
+from stages.training.schedule import SCALES, Schedule
 from stages.training.trainer import Trainer
 from stages.training.views import Level, TrainingView
 from tests.benchmarks.gate import check_kernels
@@ -51,7 +51,7 @@ class Stepper:
         photograph = r.integers(0, 256, (3, camera.height, camera.width)).astype(np.uint8)
         photograph[:] = photograph.mean(2, keepdims=True)  # stripes: something to fit, not noise
         level = Level(camera, photograph, channel_means(photograph))
-        photo = TrainingView("stripes", (level, level))
+        photo = TrainingView("stripes", (level,) * len(SCALES))
         schedule = Schedule(10_000, 1e-3, splats.sh_degree, len(splats), 0)
         folder = Path(tempfile.gettempdir())
         self.trainer = Trainer(
