@@ -119,5 +119,6 @@ def _progress() -> Iterator[Callable[[str], None]]:
     def update(rows: int, total: int) -> None:
         bar.update(task, completed=rows, total=total)
 
-    with bar, progress_reported_to(update):
+    # Some versions of Rich print an empty line at the end of a bar that is off.
+    with bar if shown else contextlib.nullcontext(), progress_reported_to(update):
         yield begin
