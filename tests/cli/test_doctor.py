@@ -50,5 +50,5 @@ def test_kernels_of_other_versions_are_counted(
         (tmp_path / name).mkdir()
         (tmp_path / name / "x.nbi").write_bytes(bytes(size))
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kernels-own"))
-    told = doctor._kernel_cache()
-    assert told == f"{tmp_path / 'kernels-own'}, 2.0 kB; 1 other version beside it, 3.0 kB"
+    value = doctor._kernel_cache()
+    assert value == f"{tmp_path / 'kernels-own'}, 2.0 kB; 1 other version beside it, 3.0 kB"
