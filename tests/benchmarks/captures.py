@@ -32,31 +32,38 @@ class Source:
     Args:
         repository: on GitHub.
         folder: of the capture there.
-        parts: files and folders of it that are copied.
+        parts: files and folders of it that are copied. A pattern such as *.JPG stands for all
+            files so named, which are copied into `images`.
         every: of the pictures, in the order of their names, the first and each so many-th after it.
+        commit: where the newest one does not have it.
     """
 
     repository: str
     folder: str
     parts: tuple[str, ...] = ("images",)
     every: int = 1
+    commit: str = "HEAD"
 
     @property
     def text(self) -> str:
         """Where it is, in words."""
         some = f", one picture in {self.every}" if self.every > 1 else ""
         where = f"{self.folder}: " if self.folder else ""
+        where = where if self.commit == "HEAD" else f"commit {self.commit[:7]}, {where}"
         return f"https://github.com/{self.repository}, {where}{', '.join(self.parts)}{some}"
 
 
 _LLFF = ("images", "poses_bounds.npy")
+_NERF_SYNTHETIC = ("train", "test", "transforms_train.json", "transforms_test.json")
 SOURCES = {
     "banana": Source("pierotofy/dataset_banana", ""),
     "plush": Source("noname0310/snowmiku2023plush-splat", "", ("input",)),
-    "lego": Source(
-        "luo-ziyuan/CopyRNeRF-code",
-        "data/nerf_synthetic/lego",
-        ("train", "test", "transforms_train.json", "transforms_test.json"),
+    "lego": Source("luo-ziyuan/CopyRNeRF-code", "data/nerf_synthetic/lego", _NERF_SYNTHETIC),
+    "mic": Source(
+        "skywolf829/GSTK",
+        "data/mic",
+        _NERF_SYNTHETIC,
+        commit="cc9ace63c30d9bdbf9931b01786537316619821b",
     ),
     "fern": Source("luo-ziyuan/CopyRNeRF-code", "data/nerf_llff_data/fern", _LLFF),
     "horns": Source("Bussler/CustomNeRF", "data/horns", _LLFF),
@@ -67,6 +74,7 @@ SOURCES = {
         )
         for name in ("fountain-P11", "Herz-Jesus-P25")
     },
+    "bonsai": Source("EricXu23/Bonsaidownload", "", ("*.JPG",)),
     "table": Source("Scodive/Data", ""),
     "statue-of-liberty": Source("vork/StatueOfLiberty-Photogrammetry", "", PICTURES, every=3),
 }
@@ -80,13 +88,14 @@ def photographs_of(capture: Path) -> Path:
 
 def copy_from(clone: Path, source: Source, into: Path) -> None:
     """Copy a capture from a clone, bare or not. Raises CalledProcessError where it is not there."""
-    tree = f"HEAD:{source.folder}" if source.folder else "HEAD"
+    tree = f"{source.commit}:{source.folder}" if source.folder else source.commit
     words = ["git", "-C", str(clone), "archive", tree, *source.parts]
+    gathered = any("*" in part for part in source.parts)
     packed = subprocess.run(words, capture_output=True, check=True).stdout
     with tarfile.open(fileobj=io.BytesIO(packed)) as archive:
         files = [member for member in archive.getmembers() if member.isfile()]
         for member in chosen(files, source.every):
-            path = into / member.name
+            path = into / (f"images/{Path(member.name).name}" if gathered else member.name)
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(cast(IO[bytes], archive.extractfile(member)).read())
     if _TRUE_CAMERAS in source.parts:

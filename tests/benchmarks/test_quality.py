@@ -44,6 +44,10 @@ def test_a_capture_is_copied_from_a_clone_with_a_part_of_its_pictures(tmp_path: 
     found = sorted(path.relative_to(into).as_posix() for path in into.rglob("*.*"))
     pictures = [f"{part}/{n}.jpg" for part in ("images", "masks") for n in (0, 3, 6)]
     assert found == [*pictures, "poses.npy"]
+    subprocess.run([*git, "rm", "-q", "-r", "b"], check=True)
+    subprocess.run([*git, "commit", "-q", "-m", "b"], check=True)
+    captures.copy_from(clone, Source("x/y", "b", ("*.jpg",), commit="HEAD~1"), tmp_path / "b")
+    assert len(list((tmp_path / "b" / "images").iterdir())) == 7
 
 
 def test_true_cameras_see_points_where_their_file_says(tmp_path: Path) -> None:
