@@ -99,11 +99,15 @@ def about_capture(
     """Warns about the capture as a whole; returns the names of blurred photographs."""
     panoramas = sum(photo.face is not None for photo in photos)
     if len(photos) < FEWEST_WITHOUT_WARNING and panoramas < FEWEST_PANORAMAS:
-        warn(
-            "ingest-few-photographs",
-            f"The capture holds {counted(len(photos), 'usable photograph')}. An object or a room "
-            "needs 20 to 50: take more, in small steps around the scene, with 60-80 % overlap.",
+        what = "usable photograph"
+        wanted = (
+            "An object or a room needs 20 to 50: take more, in small steps around the scene, with "
+            "60-80 % overlap."
         )
+        if panoramas == len(photos):
+            what = "usable 360-degree picture"
+            wanted = f"A room needs about {FEWEST_PANORAMAS}: take more, each a step from the last."
+        warn("ingest-few-photographs", f"The capture holds {counted(len(photos), what)}. {wanted}")
     median = float(np.median([photo.sharpness for photo in photos]))
     blurred = [photo.name for photo in photos if photo.sharpness < BLURRED_BELOW * median]
     if median < SOFT_BELOW:

@@ -1,9 +1,10 @@
 """Measured depth beside photographs: which file belongs to which photograph, and what it holds.
 
 Read are 16-bit PNG and TIFF (millimetres), and TIFF, EXR and .npy of floating-point numbers
-(metres): the depth along the camera's axis (z), 0 or NaN where nothing was measured. A
-transforms.json of nerfstudio's names a map for each photograph, and the metres of one step of all.
-Apps of phones write how confident they are, in three levels; only the highest is used.
+(metres): the depth along the camera's axis (z). 0, NaN and the largest number of 16 bits say that
+nothing was measured. A transforms.json of nerfstudio's names a map for each photograph, and the
+metres of one step of all. Apps of phones write how confident they are, in three levels; only the
+highest is used.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from stages.scene import fitted_size
 FOLDERS = ("depth", "depths")  # beside the photographs' folder, or in it
 CONFIDENCE = "confidence"  # a folder beside that of the maps
 SUFFIXES = frozenset({".png", ".tif", ".tiff", ".exr", ".npy"})
+LARGEST = 0xFFFF  # what depth sensors write where they measured nothing, if not 0
 MAX_SIDE = 320  # of a map that is kept, pixels: seeds are no denser
 _MOST_BYTES = 1 << 30
 _EXPORT = "Export it as 16-bit PNG in millimetres, or as TIFF, EXR or .npy in metres"
@@ -139,7 +141,10 @@ def read_depth(file: DepthFile, decoded: Decoded) -> NDArray[np.float32]:
     whole = values.dtype.kind != "f"
     with np.errstate(over="ignore", invalid="ignore"):
         metres = values.astype(np.float32) * np.float32(file.unit or (MILLIMETRE if whole else 1))
-        metres = np.where(np.isfinite(metres) & (metres > 0), metres, np.float32(0))
+        known = np.isfinite(metres) & (metres > 0)
+        if whole:
+            known &= values != LARGEST
+        metres = np.where(known, metres, np.float32(0))
     if sure is not None and sure.shape == metres.shape:
         highest = 2 if sure.max() <= 2 else 255
         metres = np.where(sure >= highest, metres, np.float32(0))

@@ -84,12 +84,13 @@ def scale_from_gps(
     all differences of height: cameras that look straight down say little of the level.
 
     Args:
-        photos: [V] the registered photographs.
+        photos: [V] the registered photographs; faces of one picture count once.
         centres: [V, 3] of their cameras.
         levelled: whether up is -Y.
         report: receives metrics, and a warning where GPS cannot be used.
     """
-    rows = np.array([i for i, photo in enumerate(photos) if photo.gps is not None], np.intp)
+    pictures = {photo.source: i for i, photo in enumerate(photos)}
+    rows = np.array([i for i in pictures.values() if photos[i].gps is not None], np.intp)
     report.metric("with_gps", len(rows))
     if not len(rows):
         return None
@@ -117,7 +118,7 @@ def scale_from_gps(
     elif residual > _WORST_RESIDUAL * spread:
         unused = f"they differ from the cameras by {residual:.1f} m (RMS)"
     if unused:
-        _report_unused(unused, len(rows), len(photos), spread, report)
+        _report_unused(unused, len(rows), len(pictures), spread, report)
         return None
     # (x + iz) e^(i angle) rotates x towards z; `about_vertical` rotates the other way.
     metres, turn = float(abs(factor)), about_vertical(-float(np.angle(factor)))

@@ -90,7 +90,10 @@ def _incremental(job: Job, scratch: Path) -> dict[int, pycolmap.Reconstruction]:
     options.random_seed = options.mapper.random_seed = job.seed
     options.triangulation.random_seed = job.seed
     options.mapper.num_threads = 1
-    options.min_model_size = SMALLEST_MODEL
+    # COLMAP counts images, of which a panorama is twelve: two in common would end a second model.
+    images = np.bincount(job.frames)
+    options.min_model_size = SMALLEST_MODEL * int(images.min())
+    options.max_model_overlap *= int(images.max())
     options.max_num_models = MOST_MODELS
     options.max_runtime_seconds = job.max_seconds
     # Takes an eighth less time than COLMAP's 5 and 2, and gives the same poses.

@@ -11,6 +11,7 @@ from typing import Any
 import av
 import numpy as np
 import pytest
+from PIL import Image
 
 from stages import ingest
 from stages.base.errors import Family, SplatError
@@ -106,6 +107,17 @@ def test_what_is_not_a_positive_number_was_not_measured(photos: Path) -> None:
     assert found is not None
     assert not found[0, :4].any()
     np.testing.assert_array_equal(found[1:], METRES[1:])
+
+
+def test_the_largest_number_of_16_bits_was_not_measured(photos: Path) -> None:
+    stored = MILLIMETRES.copy()
+    stored[0, :4] = 65535
+    (photos / "depth").mkdir()
+    Image.fromarray(stored).save(photos / "depth" / "IMG_1.png")
+    (found, *_) = maps_of(taken(photos)[0])
+    assert found is not None
+    assert not found[0, :4].any()
+    np.testing.assert_allclose(found[1:], METRES[1:], atol=1e-6)
 
 
 @pytest.mark.parametrize("where", ["photos/depth", "photos/depths", "depth"])

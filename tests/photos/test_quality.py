@@ -119,7 +119,9 @@ def test_too_few_and_near_duplicates_are_reported() -> None:
 def test_twelve_panoramas_are_enough_for_a_room() -> None:
     face = Face("rig", "a.jpg", (1.0, 0.0, 0.0, 0.0))
     assert codes([photo(i, face=face) for i in range(12)]) == {}
-    assert set(codes([photo(i, face=face) for i in range(11)])) == {"ingest-few-photographs"}
+    few = codes([photo(i, face=face) for i in range(11)])
+    assert set(few) == {"ingest-few-photographs"}
+    assert "11 usable 360-degree pictures. A room needs about 12" in few["ingest-few-photographs"]
 
 
 def test_long_lists_of_names_are_cut() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report
-from stages.scene import Camera, Photo
+from stages.scene import Camera, Face, Photo
 from stages.scene.place import (
     EAST_DOWN_NORTH,
     GEOGRAPHIC,
@@ -100,6 +100,22 @@ def test_corrected_positions_level_the_world_and_others_do_not() -> None:
     exact, report = placed(photographs(truth, error_m=0.02), centres)
     assert metres_apart(geographic(exact, centres), truth) < CENTIMETRE
     assert report.metrics["gps_in_three_dimensions"] == len(local)
+
+
+def test_faces_of_a_panorama_have_one_position() -> None:
+    """Two panoramas of twelve faces agree with any scale."""
+    report = Report()
+    photos, cameras = [], []
+    for photo in photographs(on_earth(flight(2))):
+        for _ in range(12):
+            face = Face("rig", photo.name, (1.0, 0.0, 0.0, 0.0))
+            photos.append(replace(photo, name=f"{photo.name}/{len(photos)}", face=face))
+            pose = np.eye(4)
+            pose[0, 3] = len(cameras) // 12
+            cameras.append(Camera(640, 480, 600.0, 600.0, 320.0, 240.0, pose))
+    assert find_metric_scale(UNKNOWN_SCALE, photos, cameras, [], True, report) is None
+    assert report.metrics["with_gps"] == 2
+    assert "2 of 2 photographs" in dict(report.warnings)["sfm-gps-unused"]
 
 
 def test_heights_that_a_tilt_explains_level_the_world() -> None:

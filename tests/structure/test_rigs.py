@@ -63,6 +63,27 @@ def test_the_database_has_the_rig_with_the_turns_that_faces_were_cut_at(tmp_path
         assert cameras[camera_id].params.tolist() == [240.0, 240.0, 240.0, 0.0]
 
 
+@pytest.mark.parametrize("single", [0, 1])
+def test_limits_of_the_mapper_count_panoramas(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, single: int
+) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    from stages.structure import mapping
+
+    taken = capture(tmp_path, 4)
+    job = job_of(replace(taken, photos=taken.photos[: 4 * FACES + single]), tmp_path, 0, 9, "auto")
+    found = []
+    monkeypatch.setattr(
+        pycolmap, "incremental_mapping", lambda *args, **_: found.append(args) or {}
+    )
+    mapping.map_photographs(replace(job, out=str(tmp_path / "model")))
+    options = found[0][3]
+    assert (
+        options.max_model_overlap == FACES * pycolmap.IncrementalPipelineOptions().max_model_overlap
+    )
+    assert options.min_model_size == mapping.SMALLEST_MODEL * (1 if single else FACES)
+
+
 def test_no_two_faces_of_one_panorama_are_matched(tmp_path: Path) -> None:
     frames = job_of(capture(tmp_path, 2), tmp_path, 0, 1000, "auto").frames
     assert frames.tolist() == [0] * FACES + [1] * FACES + [2]
