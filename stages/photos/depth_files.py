@@ -37,6 +37,9 @@ MAX_SIDE = 320  # of a map that is kept, pixels: seeds are no denser
 _MOST_BYTES = 1 << 30
 _EXPORT = "Export it as 16-bit PNG in millimetres, or as TIFF, EXR or .npy in metres"
 _SCANNER_APP = re.compile(r"(^|/)depth(_[0-9]+\.)")  # depth_00012.png is of frame_00012.jpg
+# The header of an EXR whose one channel has a name of one letter, such as Record3D's "R". FFmpeg
+# reads one channel only if it is called "Y".
+_ONE_CHANNEL = re.compile(rb"(channels\0chlist\0\x13\0\0\0)[A-Za-z]\0")
 _CONFIDENCE = re.compile(r"(^|/)conf_[0-9]+\.")
 
 
@@ -180,11 +183,18 @@ def _values(path: Path) -> NDArray[Any]:
 
 
 def _exr(path: Path) -> NDArray[np.float32]:
-    """The grey channel, or red."""
+    """The only channel, or red; as 16 or 32 bits."""
     import av
 
-    with av.open(io.BytesIO(path.read_bytes()), "r", format="exr_pipe") as opened:
+    data = _ONE_CHANNEL.sub(rb"\1Y\0", path.read_bytes(), count=1)
+    with av.open(io.BytesIO(data), "r", format="exr_pipe") as opened:
         codec = opened.streams.video[0].codec_context
+        if not codec.width:  # FFmpeg knows no such file
+            raise Unusable(f"{path.name} does not decode", _EXPORT)
         check_size((codec.width, codec.height))
-        values = next(opened.decode(video=0)).to_ndarray()
-    return np.asarray(values if values.ndim == 2 else values[..., 0], np.float32)
+        frame = next(opened.decode(video=0))
+    name = frame.format.name  # PyAV converts not all of them
+    number = np.dtype(("<", ">")[name.endswith("be")] + ("f4", "f2")["f16" in name])
+    plane = frame.planes[0 if name.startswith("grayf") else 2]  # green, blue, red
+    values = np.frombuffer(bytes(plane), number).reshape(frame.height, -1)
+    return np.asarray(values[:, : frame.width], np.float32)

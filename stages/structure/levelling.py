@@ -12,6 +12,7 @@ from stages.structure.sparse_model import SparseModel, point_errors
 _ROLL_TOLERANCE_DEG = 12.0  # by how much hand-held cameras roll
 _AGREEING_SHARE = 0.7
 _PRIOR_WEIGHT = 0.002  # matters only if the cameras' x axes are nearly parallel
+_OPPOSED = 0.5  # length of the mean direction of the tops; less: they point opposite ways
 _ITERATIONS = 20
 
 
@@ -22,9 +23,14 @@ def up_direction(rotations: NDArray[np.float64]) -> NDArray[np.float64] | None:
     the direction most nearly perpendicular to all of them, at any pitch. Photographs that were
     rolled or in portrait format are outliers (iteratively reweighted least squares, Cauchy
     weights). Returns None if the cameras do not agree.
+
+    If all x axes are parallel, up is where the tops of the pictures are; or, where these are
+    opposed, against the viewing direction: a survey flight turns round after each strip.
     """
     right, down, forward = rotations[:, 0], rotations[:, 1], rotations[:, 2]
     mean_up = -down.mean(axis=0)
+    if np.linalg.norm(mean_up) < _OPPOSED:
+        mean_up = -forward.mean(axis=0)
     prior = _PRIOR_WEIGHT * (mean_up @ mean_up * np.eye(3) - np.outer(mean_up, mean_up))
     tolerance = np.sin(np.radians(_ROLL_TOLERANCE_DEG))
     weights = np.ones(len(rotations))

@@ -36,12 +36,13 @@ METRES[4, 5] = 0.0
 MILLIMETRES = np.round(1000 * METRES).astype(np.uint16)
 
 
-def write_exr(path: Path, values: np.ndarray) -> None:
-    """Grey [H, W] or colour [H, W, 3] as floats."""
+def write_exr(path: Path, values: np.ndarray, half: bool = False) -> None:
+    """Grey [H, W] or colour [H, W, 3] as floats, of 16 bits if `half`."""
     kind = "grayf32le" if values.ndim == 2 else "gbrpf32le"
     made = io.BytesIO()
     with av.open(made, "w", format="image2pipe") as out:
-        stream = out.add_stream("exr", rate=1)
+        options = {"format": "half" if half else "float"}
+        stream = out.add_stream("exr", rate=1, options=options)
         stream.width, stream.height, stream.pix_fmt = values.shape[1], values.shape[0], kind
         frame = av.VideoFrame.from_ndarray(values, format=kind)
         frame.pts = 0
@@ -97,6 +98,33 @@ def test_the_red_channel_of_a_colour_exr_is_the_depth(photos: Path) -> None:
     (photos / "depth").mkdir()
     write_exr(photos / "depth" / "IMG_1.exr", np.stack([METRES, 2 * METRES, 3 * METRES], -1))
     np.testing.assert_array_equal(maps_of(taken(photos)[0])[0], METRES)
+
+
+@pytest.mark.parametrize("channel", [b"Y", b"R", b"Z"])
+@pytest.mark.parametrize("half", [False, True])
+def test_the_only_channel_of_an_exr_is_the_depth(photos: Path, channel: bytes, half: bool) -> None:
+    """Record3D writes one channel, called R, of 16 bits."""
+    path = photos / "depth" / "IMG_1.exr"
+    path.parent.mkdir()
+    write_exr(path, METRES, half)
+    data = path.read_bytes()
+    assert data.count(b"\x13\0\0\0Y\0") == 1
+    path.write_bytes(data.replace(b"\x13\0\0\0Y\0", b"\x13\0\0\0" + channel + b"\0"))
+    np.testing.assert_allclose(maps_of(taken(photos)[0])[0], METRES, rtol=1e-3 if half else 0)
+
+
+def test_the_red_channel_of_an_exr_of_16_bits_is_the_depth(photos: Path) -> None:
+    (photos / "depth").mkdir()
+    write_exr(photos / "depth" / "IMG_1.exr", np.stack([METRES, 2 * METRES, 3 * METRES], -1), True)
+    np.testing.assert_allclose(maps_of(taken(photos)[0])[0], METRES, rtol=1e-3)
+
+
+def test_an_exr_that_ffmpeg_does_not_know_is_left_out(photos: Path) -> None:
+    path = photos / "depth" / "IMG_1.exr"
+    path.parent.mkdir()
+    write_exr(path, METRES)
+    path.write_bytes(path.read_bytes().replace(b"Y\0", b"\0\0", 1))
+    assert "IMG_1.exr does not decode" in taken(photos)[1]["ingest-depth-left-out"]
 
 
 def test_what_is_not_a_positive_number_was_not_measured(photos: Path) -> None:

@@ -105,7 +105,8 @@ def test_corrected_positions_level_the_world_and_others_do_not() -> None:
 def test_faces_of_a_panorama_have_one_position() -> None:
     """Two panoramas of twelve faces agree with any scale."""
     report = Report()
-    photos, cameras = [], []
+    photos: list[Photo] = []
+    cameras: list[Camera] = []
     for photo in photographs(on_earth(flight(2))):
         for _ in range(12):
             face = Face("rig", photo.name, (1.0, 0.0, 0.0, 0.0))

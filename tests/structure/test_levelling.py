@@ -75,6 +75,23 @@ def test_if_all_look_straight_down_up_is_towards_the_cameras() -> None:
     assert angle_deg(up, UP) < 1.0
 
 
+@pytest.mark.parametrize("back", [4, 8])
+def test_strips_of_a_flight_that_looks_straight_down_are_levelled(back: int) -> None:
+    """Twelve photographs: the drone turned round for some of them, with half a degree of error."""
+    random = np.random.default_rng(2)
+    rotations = []
+    for number in range(12):
+        heading = np.radians(107.0 + 180.0 * (number < back) + random.normal(0, 0.5))
+        c, s, off = np.cos(heading), np.sin(heading), np.radians(random.normal(0, 0.1))
+        right = np.array([c, off, s])
+        down = np.cross([off, 1.0, off], right)
+        rotations.append(np.stack([right, down, np.cross(right, down)]))
+    world = random_rotation(6)
+    up = up_direction(np.array(rotations) @ world.T)
+    assert up is not None
+    assert angle_deg(up, world @ UP) < 1.0
+
+
 def test_random_rotations_give_no_up_direction() -> None:
     assert up_direction(np.array([random_rotation(i) for i in range(30)])) is None
 

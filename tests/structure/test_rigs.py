@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -73,11 +74,14 @@ def test_limits_of_the_mapper_count_panoramas(
     taken = capture(tmp_path, 4)
     job = job_of(replace(taken, photos=taken.photos[: 4 * FACES + single]), tmp_path, 0, 9, "auto")
     found = []
-    monkeypatch.setattr(
-        pycolmap, "incremental_mapping", lambda *args, **_: found.append(args) or {}
-    )
+
+    def mapped(*arguments: Any, **_: Any) -> dict[int, Any]:
+        found.append(arguments[3])
+        return {}
+
+    monkeypatch.setattr(pycolmap, "incremental_mapping", mapped)
     mapping.map_photographs(replace(job, out=str(tmp_path / "model")))
-    options = found[0][3]
+    (options,) = found
     assert (
         options.max_model_overlap == FACES * pycolmap.IncrementalPipelineOptions().max_model_overlap
     )
