@@ -225,7 +225,7 @@ def load(folder: Path) -> Splats:
 
 STAGE = Stage(
     name="prune",
-    version=20,
+    version=21,
     reads=("sfm", "train"),
     settings_type=PruneSettings,
     run=run,

@@ -24,7 +24,7 @@ from stages.measure.contribution import (
 )
 from stages.measure.evaluation import EvaluationView, image_renderer
 from stages.measure.rate_distortion import RateDistortion, rate_distortion_of
-from stages.measure.selection import ROUND_SHARE, Removal, select_removal
+from stages.measure.selection import BEYOND, ROUND_SHARE, Removal, select_removal
 from stages.scene import Splats, evenly_spaced
 from stages.training.finetune import FineTuner
 
@@ -201,7 +201,9 @@ class Pruner:
 
     def _measure_all(self, splats: Splats) -> Contributions:
         views = (self.views[i] for i in self._others)
-        others = measure_contributions(splats, views, self.backend) if self._others else None
+        others = None
+        if self._others:
+            others = measure_contributions(splats, views, self.backend, beyond=BEYOND)
         return self._contributions(splats, others)
 
     def _measure(self, splats: Splats, before: Contributions, removal: Removal) -> Contributions:
@@ -209,7 +211,8 @@ class Pruner:
         return self._contributions(splats, others and others.take(~removal.removed))
 
     def _contributions(self, splats: Splats, others: Contributions | None) -> Contributions:
-        return measure_contributions(splats, self._measured_views(), self.backend, others)
+        views = self._measured_views()
+        return measure_contributions(splats, views, self.backend, others, beyond=BEYOND)
 
     @staticmethod
     def _sse_change(before: Contributions, after: Contributions) -> float:

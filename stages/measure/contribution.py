@@ -95,6 +95,7 @@ def measure_contributions(
     backend: str,
     previous: Contributions | None = None,
     truncation: bool = True,
+    beyond: float = 0.0,
 ) -> Contributions:
     """The contribution of each splat to the views.
 
@@ -105,6 +106,8 @@ def measure_contributions(
         previous: contributions of the same splats to further views. They may have been measured
             before the splats around them changed a little. The result includes them.
         truncation: whether to measure the truncated figures; else these are [N, 0].
+        beyond: how far each picture is continued on all sides, as a share of its longer side. What
+            is drawn there counts as if it were right; `sse` and `psnr_db` are of the picture alone.
     """
     n = len(splats)
     change, picture, weight, kept_weight = np.zeros((4, n))
@@ -118,12 +121,14 @@ def measure_contributions(
     settings = raster_settings_of(splats)
     sh = _ShTruncation(splats, truncation, previous.sh_sums if previous else ())
     for view in views:
-        forward = rasteriser.forward(arrays, view.camera, settings, depths=True)
-        drawn, truth = forward.image[:3].transpose(1, 2, 0), view.image
-        psnr_db.append(capped_psnr_db(drawn, truth, view.valid))
-        residual = np.ascontiguousarray((drawn - truth).transpose(2, 0, 1))
+        border = round(beyond * max(view.camera.width, view.camera.height))
+        forward = rasteriser.forward(arrays, view.camera.continued(border), settings, depths=True)
+        drawn = _inside(forward.image[:3], border).transpose(1, 2, 0)
+        psnr_db.append(capped_psnr_db(drawn, view.image, view.valid))
+        residual = np.zeros_like(forward.image[:3])
+        _inside(residual, border)[:] = (drawn - view.image).transpose(2, 0, 1)
         if view.valid is not None:
-            residual *= view.valid
+            _inside(residual, border)[:] *= view.valid
         sse += float(np.sum(residual.astype(np.float64) ** 2))
         solid = forward.image[4][forward.image[3] > 0.5]
         depths.append(float(np.median(solid)) if solid.size else np.inf)
@@ -132,7 +137,7 @@ def measure_contributions(
         change[rows] += found[:, ERROR_CHANGE]
         picture[rows] += found[:, PICTURE_CHANGE]
         weight[rows] += found[:, WEIGHT]
-        kept_weight[rows] += _kept_weight(rasteriser, forward, view, found)
+        kept_weight[rows] += _kept_weight(rasteriser, forward, view, border, found)
         view_counts[rows] += found[:, LARGEST_WEIGHT] >= VISIBLE_WEIGHT
         sh.add(view.camera.centre, rows, found)
     truncated_sse_change, truncated_picture_change, truncated_colour = sh.figures()
@@ -153,17 +158,25 @@ def measure_contributions(
     )
 
 
+def _inside(image: NDArray[np.float32], border: int) -> NDArray[np.float32]:
+    """A view of `image` [C, H, W] without its border."""
+    _, height, width = image.shape
+    return image[:, border : height - border, border : width - border]
+
+
 def _kept_weight(
     rasteriser: Rasteriser,
     forward: Forward,
     view: EvaluationView,
+    border: int,
     found: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """[K] summed blend weight over the pixels that the view's mask does not ignore. found:
-    [K, ...] the rasteriser's contributions to the view."""
+    """[K] summed blend weight over the pixels that the view's mask does not ignore. border: how
+    many pixels the picture is continued by. found: [K, ...] the rasteriser's contributions."""
     if view.mask is None or view.outside != IGNORE:
         return found[:, WEIGHT]
-    kept = np.repeat((view.mask > 0).astype(np.float32)[None], 3, axis=0)
+    kept = np.pad((view.mask > 0).astype(np.float32), border, constant_values=1.0)
+    kept = np.repeat(kept[None], 3, axis=0)
     return rasteriser.contributions(forward, kept)[:, WEIGHTED_RESIDUAL]
 
 

@@ -20,6 +20,9 @@ ROUND_SHARE, NEIGHBOURS = 0.10, 4
 # What fewer views see may fill another view although it hardly shows in these: at the end of a walk
 # of 84 views, splats at the border of one or two were worth 2.5 dB in a view from beyond them.
 FEW_VIEWS = 3
+# A splat at the border of pictures, too, may fill more of another view than of these: pictures are
+# continued by this share of their longer side.
+BEYOND = 0.1
 SH_FACTOR = 2.5  # times as many splats may lose SH degrees: these hardly depend on each other
 
 

@@ -56,6 +56,12 @@ class Camera:
         lens = self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy
         return Camera(width, height, *lens, self.world_to_camera)
 
+    def continued(self, border: int) -> Camera:
+        """The camera whose picture continues this one by `border` pixels on all sides."""
+        size = self.width + 2 * border, self.height + 2 * border
+        lens = self.fx, self.fy, self.cx + border, self.cy + border
+        return Camera(*size, *lens, self.world_to_camera)
+
     def fitted(self, long_side: int) -> Camera:
         """The same view with its longer side at most `long_side` pixels; never enlarged."""
         return self.resized(*fitted_size(self.width, self.height, long_side))

@@ -44,19 +44,40 @@ def test_the_predicted_change_of_the_error_is_that_of_drawing_without_the_coeffi
             assert not np.array_equal(plain.sh[row, 0], cut.sh[row, 0])
 
 
-def test_the_predicted_change_of_the_picture_is_that_of_drawing_without_the_splat(tmp_path) -> None:
+@pytest.mark.parametrize("beyond", [0.0, 0.2])
+def test_the_predicted_change_of_the_picture_is_that_of_drawing_without_the_splat(
+    tmp_path, beyond: float
+) -> None:
+    """Also where the pictures continue beyond their edges."""
     scene = small_scene(tmp_path, views=4, n=60)
     photographs = load_evaluation_views(
         scene.reconstruction.folder, scene.reconstruction.views, scene.splats.draw_settings
     )
-    contributions = measure_contributions(scene.splats, photographs, "cpu")
+    contributions = measure_contributions(scene.splats, photographs, "cpu", beyond=beyond)
     assert (contributions.picture_change >= 0).all()
     draw = image_renderer(scene.splats, "cpu")
+    cameras = [p.camera.continued(round(beyond * p.camera.width)) for p in photographs]
     for row in (0, 10, 20):
         fewer = image_renderer(scene.splats.take(np.arange(60) != row), "cpu")
-        changes = [fewer(p.camera).astype(float) - draw(p.camera) for p in photographs]
+        changes = [fewer(camera).astype(float) - draw(camera) for camera in cameras]
         wanted = sum(np.square(change).sum() for change in changes)
         assert contributions.picture_change[row] == pytest.approx(wanted, rel=2e-3, abs=1e-5)
+
+
+def test_the_error_is_that_of_the_pictures_however_far_they_are_continued(tmp_path) -> None:
+    scene = small_scene(tmp_path, views=4, n=60)
+    photographs = load_evaluation_views(
+        scene.reconstruction.folder, scene.reconstruction.views, scene.splats.draw_settings
+    )
+    alone, found = (
+        measure_contributions(scene.splats, photographs, "cpu", beyond=beyond)
+        for beyond in (0.0, 0.2)
+    )
+    # EWA takes what lies beyond 1.15 of a picture's angle for its edge: a few splats differ there
+    assert found.sse == pytest.approx(alone.sse, rel=1e-3)
+    np.testing.assert_allclose(found.psnr_db, alone.psnr_db, rtol=1e-3)
+    assert (found.picture_change >= alone.picture_change * (1 - 1e-4)).all()
+    assert (found.view_counts >= alone.view_counts).all()
 
 
 def test_contributions_of_further_views_are_added(tmp_path) -> None:
