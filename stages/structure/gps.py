@@ -106,28 +106,27 @@ def scale_from_gps(
     if abs(factor):
         report.metric("gps_residual_m", round(residual, 3))
         report.metric("gps_agreeing", agreeing)
-    unused = ""
-    if len(rows) < _FEWEST:
-        unused = f"{_FEWEST} photographs are needed"
-    elif not levelled:
-        unused = "the up direction was not found"
-    elif abs(factor) == 0:
-        unused = "most cameras or positions are at one place"
-    elif agreeing < max(_FEWEST, _AGREEING_SHARE * len(rows)):
-        unused = f"only {agreeing} of them agree with the cameras"
-    elif residual > _WORST_RESIDUAL * spread:
-        unused = f"they differ from the cameras by {residual:.1f} m (RMS)"
+    unused = _why_unused(len(rows), levelled, abs(factor), agreeing, residual, spread)
+    errors = [photos[i].gps_error_m for i in rows]
+    exact = heights_known & [e is not None and e <= _ACCURATE_M for e in errors]
     if unused:
-        _report_unused(unused, len(rows), len(pictures), spread, report)
-        return None
+        free = _fit_3d(here[exact], there[exact], None, any_tilt=True)
+        off = math.inf if free is None else _off(here[exact], there[exact], *free)
+        few = exact.sum() < _AGREEING_SHARE * len(rows)
+        if free is None or few or off > _WORST_RESIDUAL * spread:
+            _report_unused(unused, len(rows), len(pictures), spread, report)
+            return None
+        inliers, residual, agreeing = exact, off, int(exact.sum())
+        report.metric("gps_residual_m", round(residual, 3))
+        report.metric("gps_agreeing", agreeing)
     # (x + iz) e^(i angle) rotates x towards z; `about_vertical` rotates the other way.
     metres, turn = float(abs(factor)), about_vertical(-float(np.angle(factor)))
-    errors = [photos[i].gps_error_m for i in rows]
-    exact = inliers & heights_known & [e is not None and e <= _ACCURATE_M for e in errors]
+    exact &= inliers
     accurate = int(exact.sum()) >= _FEWEST
     chosen = exact if accurate else inliers & heights_known
     level = None if accurate else metres * turn
-    if (by_all := _fit_3d(here[chosen], there[chosen], level)) is not None:
+    by_all = free if unused else _fit_3d(here[chosen], there[chosen], level)
+    if by_all is not None:
         metres, turn = by_all
         report.metric("gps_in_three_dimensions", int(chosen.sum()))
     scale = MetricScale(metres, f"GPS of {agreeing} photographs, {residual:.2g} m off", turn)
@@ -151,13 +150,20 @@ def _positions(
 
 
 def _fit_3d(
-    here: NDArray[np.float64], there: NDArray[np.float64], level: NDArray[np.float64] | None
+    here: NDArray[np.float64],
+    there: NDArray[np.float64],
+    level: NDArray[np.float64] | None,
+    *,
+    any_tilt: bool = False,
 ) -> tuple[float, NDArray[np.float64]] | None:
     """(metres per unit, rotation [3, 3] to the new world) by positions [N, 3]; None if they are few
     or nearly on a line, or contradict the level of the cameras.
 
-    level: [3, 3] scale and rotation to the new world by the level of the cameras, for positions
-    whose errors are not known: these must then explain the heights much better.
+    Args:
+        here, there: in the old world; metres east, north and up.
+        level: [3, 3] scale and rotation to the new world by the level of the cameras, for positions
+            whose errors are not known: these must then explain the heights much better.
+        any_tilt: they may contradict it.
     """
     if len(here) < (_FEWEST if level is None else _FEWEST_TILTED):
         return None
@@ -171,7 +177,20 @@ def _fit_3d(
     after = float(np.std(there[:, 2] - metres * here @ rotation[2]))
     if level is not None and after > _DECISIVE * float(np.std(there[:, 2] + here @ level[1])):
         return None
-    return (metres, turn) if turn[1, 1] >= math.cos(math.radians(_MOST_TILT_DEG)) else None
+    level_enough = any_tilt or turn[1, 1] >= math.cos(math.radians(_MOST_TILT_DEG))
+    return (metres, turn) if level_enough else None
+
+
+def _off(
+    here: NDArray[np.float64],
+    there: NDArray[np.float64],
+    metres: float,
+    turn: NDArray[np.float64],
+) -> float:
+    """RMS distance in metres of positions [N, 3] in the new world from those of the GPS, apart from
+    one offset of all."""
+    away = there - metres * here @ turn.T @ EAST_DOWN_NORTH.T
+    return float(np.sqrt(np.mean(np.sum((away - away.mean(axis=0)) ** 2, axis=1))))
 
 
 def _place(
@@ -194,6 +213,24 @@ def _place(
     ups = there[:, 2] + here[:, 1]
     shift[2] = np.median(ups[with_heights if with_heights.any() else inliers])
     return EarthPlace(GEOGRAPHIC, around, EAST_DOWN_NORTH).beside(EAST_DOWN_NORTH.T @ shift)
+
+
+def _why_unused(
+    count: int, levelled: bool, factor: float, agreeing: int, residual: float, spread: float
+) -> str:
+    """Why so many positions cannot be used by the level of the cameras; "" if they can. Arguments
+    as in `scale_from_gps`."""
+    if count < _FEWEST:
+        return f"{_FEWEST} photographs are needed"
+    if not levelled:
+        return "the up direction was not found"
+    if factor == 0:
+        return "most cameras or positions are at one place"
+    if agreeing < max(_FEWEST, _AGREEING_SHARE * count):
+        return f"only {agreeing} of them agree with the cameras"
+    if residual > _WORST_RESIDUAL * spread:
+        return f"they differ from the cameras by {residual:.1f} m (RMS)"
+    return ""
 
 
 def _report_unused(why: str, count: int, total: int, spread: float, report: Report) -> None:

@@ -102,6 +102,20 @@ def test_corrected_positions_level_the_world_and_others_do_not() -> None:
     assert report.metrics["gps_in_three_dimensions"] == len(local)
 
 
+@pytest.mark.parametrize("tilt_deg", [60.0, 90.0, 180.0])
+def test_corrected_positions_say_the_level_where_cameras_do_not(tilt_deg: float) -> None:
+    """A flight that looks straight down with one heading: its world may lie on its side."""
+    local = flight()
+    centres, truth = world_of(local, tilt=np.radians(tilt_deg)), on_earth(local)
+    found, report = placed(photographs(truth, error_m=0.02), centres)
+    assert found.metres == pytest.approx(METRES, rel=1e-3)
+    assert metres_apart(geographic(found, centres), truth) < CENTIMETRE
+    assert report.metrics["gps_in_three_dimensions"] == len(local)
+    wrong = np.random.default_rng(3).permutation(truth)
+    with pytest.raises(AssertionError):
+        placed(photographs(wrong, error_m=0.02), centres)
+
+
 def test_faces_of_a_panorama_have_one_position() -> None:
     """Two panoramas of twelve faces agree with any scale."""
     report = Report()
