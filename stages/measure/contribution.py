@@ -106,7 +106,7 @@ def measure_contributions(
         previous: contributions of the same splats to further views. They may have been measured
             before the splats around them changed a little. The result includes them.
         truncation: whether to measure the truncated figures; else these are [N, 0].
-        beyond: how far each picture is continued on all sides, as a share of its longer side. What
+        beyond: how far each picture is continued on all sides, in longer sides of the picture. What
             is drawn there counts as if it were right; `sse` and `psnr_db` are of the picture alone.
     """
     n = len(splats)
