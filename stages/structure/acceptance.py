@@ -66,7 +66,7 @@ def report_warnings(
             f"{'is' if len(missing) == 1 else 'are'} not used: {listed(missing)}. More overlap "
             f"with the others would help.{_learned_hint(features)}",
         )
-    if len(best.result.groups) > 1:
+    if any(not registered.issuperset(group) for group in best.result.groups[1:]):
         sizes = ", ".join(str(len(group)) for group in best.result.groups)
         report.warn(
             "sfm-several-models",

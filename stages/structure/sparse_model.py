@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from stages.scene.capture import PHOTOS_FOLDER
 from stages.structure.gates import THRESHOLDS, ModelStatistics
 
 _SMALLEST_PART = 0.1  # of the photographs; a few outer ones may be weakly connected
@@ -329,7 +330,7 @@ def model_statistics(result: MappingResult, photographs: int) -> ModelStatistics
 
 
 def _names(model: SparseModel, views: NDArray[np.integer]) -> tuple[str, ...]:
-    return tuple(Path(model.names[view]).name for view in views)
+    return tuple(model.names[view].removeprefix(PHOTOS_FOLDER) for view in views)
 
 
 def _largest(values: NDArray[np.float64]) -> float:

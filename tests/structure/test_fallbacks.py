@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 from stages.base.errors import SplatError
+from stages.base.stage import Report
 from stages.scene import Capture
-from stages.structure.acceptance import accepted_model
+from stages.structure.acceptance import accepted_model, report_warnings
 from stages.structure.fallbacks import (
     CONFIGURATIONS,
     LEARNED,
@@ -18,6 +19,8 @@ from stages.structure.fallbacks import (
     try_configurations,
 )
 from stages.structure.gates import ModelStatistics, failure
+from stages.structure.sparse_model import MappingResult
+from tests.structure.synthetic import orbit_model
 
 
 def failing(*codes: str) -> tuple[SplatError, ...]:
@@ -142,3 +145,13 @@ def test_sift_follows_where_learned_features_fail_first() -> None:
     attempts = try_configurations(script, out_of_time=lambda: False, features="learned")
     assert script.tried == ["learned features", "standard"]
     assert best_attempt(attempts).configuration.name == "standard"
+
+
+@pytest.mark.parametrize("other", ["02.jpg", "lost.jpg"])
+def test_a_model_that_the_largest_contains_needs_no_warning(other: str) -> None:
+    model = orbit_model(views=6, points=40)
+    result = MappingResult(model, (model.names, ("01.jpg", other)), timed_out=False)
+    attempt = Attempt(CONFIGURATIONS[0], (), ModelStatistics(photographs=6), result)
+    report = Report()
+    report_warnings([attempt], model, Capture(Path(), ()), report)
+    assert ("sfm-several-models" in dict(report.warnings)) == (other == "lost.jpg")

@@ -68,6 +68,10 @@ def test_inconsistent_pairs_are_counted_and_one_is_named() -> None:
     statistics = model_statistics(result, 6)
     assert statistics.pairs_inconsistent == 2
     assert statistics.inconsistent_pair == ("02.jpg", "03.jpg")
+    faces = tuple(f"photos/{i}.jpg/000+25.jpg" for i in range(6))
+    named = replace(result.model, names=faces) if result.model else None
+    statistics = model_statistics(replace(result, model=named), 6)
+    assert statistics.inconsistent_pair == ("2.jpg/000+25.jpg", "3.jpg/000+25.jpg")
 
 
 def test_cameras_in_one_place_have_no_baseline_and_no_angle() -> None:
