@@ -62,8 +62,10 @@ def stages_by_seconds(run: Path) -> dict[str, float]:
 
 
 def command(folder: Path, draw: random.Random) -> list[str]:
-    """The run, with other memory than before from where training has begun."""
-    begun = any((folder / "run").glob("*4-train*"))
+    """The run, with other memory than before once training has written a checkpoint. Without one
+    it starts again, by the memory there is."""
+    run = folder / "run"
+    begun = (run / "4-train").is_dir() or any(run.glob(".4-train*/checkpoint.bin"))
     free_mib = draw.uniform(*OTHER_MIB) if begun else MIB
     return processes.python(IMPATIENT, str(free_mib), *WORDS)
 
