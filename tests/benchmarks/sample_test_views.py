@@ -31,7 +31,7 @@ PLACES = (
     *((5.0, -0.55, 1.02), (12.0, -0.50, 1.00), (18.0, -0.60, 1.02)),
     *((7.0, -1.12, 1.08), (15.0, -1.12, 1.08)),
 )
-HIGHER = 2  # the last of PLACES: much of what they show is seen at grazing angles, or not at all
+HIGHER = 2  # the last of PLACES: no photograph looks down as steeply
 Poses = Mapping[str, NDArray[np.float64]]
 _SHAKE_M = 0.04  # of the point looked at
 
