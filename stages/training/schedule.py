@@ -21,9 +21,8 @@ DENSIFICATION_END = 0.5  # share of the run in which the model is densified
 # A run that is n times shorter than the published one, at most MOST_SHORTENED times, multiplies its
 # learning rates by n to these powers (docs/experiments/densification.md).
 MOST_SHORTENED = 20.0
-RATES_POWER = 0.6  # all, but those below
+RATES_POWER = 0.6  # all, but that of the means at the end
 MEANS_END_POWER = 1.2
-LOG_SCALES_POWER = 0.8
 # Learning rates decay from this share of the run on, to this share of their value.
 RATE_DECAY_FROM, RATE_DECAY_END = 0.6, 0.1
 MIN_DENSIFY_INTERVAL = 50  # steps: fewer see too little of the scene
@@ -90,21 +89,15 @@ class Schedule:
         times = min(MOST_SHORTENED, max(1.0, PUBLISHED_STEPS / self.steps))
         return float(times**power)
 
-    def rates(self, step: int, few_views: bool = False) -> LearningRates:
-        """The learning rates of `step`: those of the means decay exponentially over the run, all
-        others from RATE_DECAY_FROM on.
-
-        few_views: raises the rate of log scales no more than the others. Splats that grow faster
-        become clouds in front of cameras if few training views show them.
-        """
+    def rates(self, step: int) -> LearningRates:
+        """The learning rates of `step`: that of the means decays exponentially over the run, all
+        others from RATE_DECAY_FROM on."""
         first = MEANS_LR * self.raised(RATES_POWER)
         last = MEANS_LR_END * self.raised(MEANS_END_POWER)
         means = first * (last / first) ** self.share(step)
         decay = max(0.0, (self.share(step) - RATE_DECAY_FROM) / (1.0 - RATE_DECAY_FROM))
         factor = self.raised(RATES_POWER) * RATE_DECAY_END**decay
-        rates = LearningRates().scaled(means * self.extent, factor, self.extent)
-        power = RATES_POWER if few_views else LOG_SCALES_POWER
-        return replace(rates, log_scales=rates.log_scales * self.raised(power - RATES_POWER))
+        return LearningRates().scaled(means * self.extent, factor, self.extent)
 
     def active_sh_degree(self, step: int) -> int:
         """One degree more every 1000 of 30,000 steps."""

@@ -127,7 +127,7 @@ class Trainer:
         settings = self.raster_settings(schedule.active_sh_degree(step))
         if self.random_background:
             settings = replace(settings, background=schedule.background(step))
-        rates = schedule.rates(step, few_views=self.dropout)
+        rates = schedule.rates(step)
         dropout = None
         if self.dropout and not schedule.densifying(step):  # it would distort the mean gradients
             dropout = Dropout(len(self.train), schedule.dropout_key(step))
