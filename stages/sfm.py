@@ -305,5 +305,5 @@ def _load_finished(folder: Path, report: Report) -> Reconstruction:
 
 
 STAGE = Stage(
-    name="sfm", version=22, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
+    name="sfm", version=23, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
 )

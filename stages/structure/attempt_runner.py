@@ -142,6 +142,7 @@ class AttemptRunner:
             matching="exhaustive" if more else base.matching,
             drop_stationary=configuration.drop_stationary,
             loose=configuration.loose,
+            strongest_start=configuration.strongest_start,
         )
 
     def _extract_features(self, job: Job) -> None:

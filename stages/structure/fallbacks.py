@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from stages.base.errors import SplatError
-from stages.structure.gates import ModelStatistics
+from stages.structure.gates import ModelStatistics, poses_contradicted
 from stages.structure.sparse_model import MappingResult
 
 
@@ -23,7 +23,7 @@ class Configuration:
         more_features: lower SIFT's peak threshold, allow more features, and match every pair,
             whatever the settings say.
         learned: add learned features and their matches to SIFT's.
-        drop_stationary, loose: as in `job.Job`.
+        drop_stationary, loose, strongest_start: as in `job.Job`.
         fixes: codes of the failures after which this configuration is tried.
     """
 
@@ -32,6 +32,7 @@ class Configuration:
     learned: bool = False
     drop_stationary: bool = False
     loose: bool = False
+    strongest_start: bool = False
     fixes: frozenset[str] = frozenset()
 
 
@@ -47,6 +48,8 @@ LEARNED = Configuration(
     learned=True,
     fixes=_UNREGISTERED | _UNCONNECTED | _SPARSE | {"sfm-weak-link"},
 )
+# For a model that passed although several pairs contradict it: another may fit them better.
+ANOTHER_START = Configuration("another initial pair", strongest_start=True)
 CONFIGURATIONS = (  # by SIFT alone
     Configuration("standard"),
     Configuration("without stationary matches", drop_stationary=True, fixes=_CAMERA),
@@ -87,6 +90,12 @@ class Attempt:
         return not self.failures
 
     @property
+    def inconsistent_share(self) -> float:
+        """The share of pairs whose verified matches contradict the poses."""
+        found = self.statistics
+        return (found.pairs_inconsistent - found.pairs_turned) / max(1, found.pairs_checked)
+
+    @property
     def rank(self) -> tuple[bool, int, int, int]:
         """Orders attempts that failed: models that learned features may have joined falsely are the
         last, then by registered photographs, points, and the size of any model found."""
@@ -98,8 +107,14 @@ class Attempt:
 
 def best_attempt(attempts: list[Attempt]) -> Attempt:
     """The attempt that passed with most registered photographs, the first of them; if none passed,
-    the one of the highest rank."""
+    the one of the highest rank. Of the standard model and that from another initial pair only
+    one counts: the second if at most half as many pairs contradict it."""
     passed = [attempt for attempt in attempts if attempt.passed]
+    again = [attempt for attempt in passed if attempt.configuration is ANOTHER_START]
+    if again:
+        standard = next(a for a in passed if a.configuration is CONFIGURATIONS[0])
+        better = again[0].inconsistent_share <= standard.inconsistent_share / 2
+        passed.remove(standard if better else again[0])
     if passed:
         return max(passed, key=lambda attempt: attempt.statistics.registered)
     return max(attempts, key=lambda attempt: attempt.rank)
@@ -108,11 +123,12 @@ def best_attempt(attempts: list[Attempt]) -> Attempt:
 def configurations(features: str) -> tuple[Configuration, ...]:
     """The configurations in order. features: "sift", "auto" (learned features second) or "learned"
     (first)."""
+    first, *others = CONFIGURATIONS
     if features == "sift":
-        return CONFIGURATIONS
+        return (first, ANOTHER_START, *others)
     if features == "learned":
-        return (LEARNED, *CONFIGURATIONS)
-    return (CONFIGURATIONS[0], LEARNED, *CONFIGURATIONS[1:])
+        return (LEARNED, first, ANOTHER_START, *others)
+    return (first, ANOTHER_START, LEARNED, *others)
 
 
 def try_configurations(
@@ -123,7 +139,8 @@ def try_configurations(
 ) -> list[Attempt]:
     """The attempts, in order, until one passes, no configuration left may help, or time is up.
 
-    If the first passes and leaves photographs out, learned features are tried all the same.
+    If the first passes and leaves photographs out, learned features are tried all the same; if
+    the standard one passes and pairs contradict its poses, another initial pair.
 
     Args:
         run: runs one configuration.
@@ -143,6 +160,10 @@ def try_configurations(
 
 def _may_help(configuration: Configuration, attempts: list[Attempt]) -> bool:
     if any(attempt.passed for attempt in attempts):
+        if configuration is ANOTHER_START:
+            last = attempts[-1]
+            standard = last.configuration is CONFIGURATIONS[0]
+            return standard and last.passed and poses_contradicted(last.statistics)
         return configuration.learned and attempts[0].statistics.left_out > 0
     by_sift = [attempt for attempt in attempts if not attempt.configuration.learned]
     failures = {failure.code for failure in (by_sift or attempts)[-1].failures}

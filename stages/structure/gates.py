@@ -43,6 +43,8 @@ class ModelStatistics:
             is farthest from 1; None without EXIF.
         pairs_checked: pairs of photographs with at least 30 verified matches.
         pairs_inconsistent: those of them whose matches do not fit the poses of the model.
+        pairs_turned: those of the inconsistent pairs whose verified matches fit, but of which the
+            others show the scene turned.
         inconsistent_pair: the names of one such pair.
         rotation_to_other_deg: largest disagreement between this model and another of COLMAP's
             models about the relative rotation of photographs that are in both.
@@ -67,6 +69,7 @@ class ModelStatistics:
     focal_over_prior: float | None = None
     pairs_checked: int = 0
     pairs_inconsistent: int = 0
+    pairs_turned: int = 0
     inconsistent_pair: tuple[str, ...] = ()
     rotation_to_other_deg: float = 0.0
     cut_points: int = 0
@@ -116,6 +119,7 @@ class Thresholds:
 
 
 THRESHOLDS = Thresholds()
+WARNED_SHARE = 0.02  # of the pairs that contradict a model: deserves a warning
 
 
 def failure(code: str, given: str, wanted: str, hint: str) -> SplatError:
@@ -200,7 +204,16 @@ def check_model(model: ModelStatistics) -> list[SplatError]:
 
 def borderline_failures(model: ModelStatistics) -> list[SplatError]:
     """Failures of stricter thresholds, which deserve a warning but do not refuse a model."""
-    return list(_check_consistency(model, Thresholds(inconsistent_share=0.02, cut_points=100)))
+    stricter = Thresholds(inconsistent_share=WARNED_SHARE, cut_points=100)
+    return list(_check_consistency(model, stricter))
+
+
+def poses_contradicted(model: ModelStatistics) -> bool:
+    """Whether the verified matches of so many pairs contradict the poses that they may be wrong.
+    Turned pairs say nothing about that."""
+    misfit = model.pairs_inconsistent - model.pairs_turned
+    share = WARNED_SHARE * model.pairs_checked
+    return misfit >= THRESHOLDS.fewest_inconsistent and misfit > share
 
 
 def _check_geometry(model: ModelStatistics, thresholds: Thresholds) -> Iterator[SplatError]:

@@ -59,6 +59,7 @@ class Job:
         matching: which pairs: "selected" by retrieval, "exhaustive" or "sequential".
         drop_stationary: drop matches that stay in place in the picture (a date stamp).
         loose: register photographs with fewer inliers.
+        strongest_start: start mapping from `initial_pair.strongest_pair`.
         refine: refine the poses of known cameras.
         max_seconds: time limit of mapping.
         source: of a chunk: the database of the whole job; of "learned": that of SIFT.
@@ -85,6 +86,7 @@ class Job:
     matching: str = "selected"
     drop_stationary: bool = False
     loose: bool = False
+    strongest_start: bool = False
     refine: bool = False
     max_seconds: int = 3600
     source: str = ""

@@ -14,6 +14,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from stages.structure.epipolar import MatchedPair, epipolar_distances, inlier_ratios
+from stages.structure.initial_pair import LEAST_ANGLE_DEG, strongest_pair
 from stages.structure.job import Job, ProgressWriter
 from stages.structure.sparse_model import SparseModel, save_model
 
@@ -111,6 +112,8 @@ def _incremental(job: Job, scratch: Path) -> dict[int, pycolmap.Reconstruction]:
         options.mapper.abs_pose_min_inlier_ratio = 0.15
         options.mapper.init_min_num_inliers = 50
         options.mapper.init_min_tri_angle = 8.0
+    if job.strongest_start:
+        _start_from_strongest_pair(options, job)
     registered = itertools.count(1)
     progress = ProgressWriter(job)
 
@@ -132,6 +135,17 @@ def _incremental(job: Job, scratch: Path) -> dict[int, pycolmap.Reconstruction]:
             next_image_callback=one_more,
         )
     )
+
+
+def _start_from_strongest_pair(options: pycolmap.IncrementalPipelineOptions, job: Job) -> None:
+    """Start from `initial_pair.strongest_pair`, and make one model: a second one would start from
+    the same pair."""
+    with pycolmap.Database.open(job.database) as database:
+        pair = strongest_pair(job, database, verified_matches(database))
+    if pair is not None:
+        options.init_image_id1, options.init_image_id2 = pair
+        options.mapper.init_min_tri_angle = LEAST_ANGLE_DEG / 2  # COLMAP measures it otherwise
+        options.multiple_models = False
 
 
 def _sparse_model(
@@ -236,8 +250,8 @@ def verified_matches(
 def _pair_inlier_ratios(
     job: Job, model: pycolmap.Reconstruction, position: dict[int, int]
 ) -> dict[str, np.ndarray]:
-    """`SparseModel.pairs` and `pair_inlier_ratios`: of the matches that two-view geometry verified,
-    the share that also fits the model's poses; 0 for the pairs of `_turned_pairs`."""
+    """`pairs`, `pair_inlier_ratios` and `pairs_turned` of `SparseModel`, of the matches that
+    two-view geometry verified."""
     progress = ProgressWriter(job)
     normalised: dict[int, np.ndarray] = {}  # undistorted pixels, relative to the principal point
     focal = {i: model.cameras[model.images[i].camera_id].mean_focal_length() for i in position}
@@ -263,8 +277,13 @@ def _pair_inlier_ratios(
             a, b = (normalised[image][matches[:, k]] for k, image in enumerate(both))
             turns.append(_turn((*pairs[-1], a, b), intrinsics, poses, side, job.seed))
     found = np.nan_to_num(np.array(ratios, np.float64), nan=1.0)
-    found[_turned_pairs(turns)] = 0.0
-    return {"pairs": np.array(pairs, np.int32).reshape(-1, 2), "pair_inlier_ratios": found}
+    turned = np.zeros(len(pairs), np.bool_)
+    turned[_turned_pairs(turns)] = True
+    return {
+        "pairs": np.array(pairs, np.int32).reshape(-1, 2),
+        "pair_inlier_ratios": found,
+        "pairs_turned": turned,
+    }
 
 
 def _turn(

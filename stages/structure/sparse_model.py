@@ -96,6 +96,8 @@ class SparseModel:
         observed_points, observing_views, observed_px: [O], [O], [O, 2]; sorted by point, then view.
         pairs: [Q, 2] indices of photographs that share many matches.
         pair_inlier_ratios: [Q] share of those matches that fits the poses of the model.
+        pairs_turned: [Q] whether the other matches of a pair show the scene turned, as those of
+            several other pairs do.
         rotations_to_others_deg: [M] for each smaller model with photographs in common: the largest
             disagreement about their relative rotations.
     """
@@ -114,6 +116,7 @@ class SparseModel:
     observed_px: NDArray[np.float64]
     pairs: NDArray[np.int32]
     pair_inlier_ratios: NDArray[np.float64]
+    pairs_turned: NDArray[np.bool_]
     rotations_to_others_deg: NDArray[np.float64]
 
     @property
@@ -218,6 +221,7 @@ def _with_views(model: SparseModel, keep_view: NDArray[np.bool_]) -> SparseModel
         observed_px=model.observed_px[kept],
         pairs=new_view[model.pairs[pairs]].astype(np.int32),
         pair_inlier_ratios=model.pair_inlier_ratios[pairs],
+        pairs_turned=model.pairs_turned[pairs],
     )
 
 
@@ -300,7 +304,8 @@ def model_statistics(result: MappingResult, photographs: int) -> ModelStatistics
     sample = np.arange(0, len(model.points), max(1, len(model.points) // _SAMPLED_POINTS))
     angles = triangulation_angles(model, sample)
     errors = point_errors(model)
-    inconsistent = np.flatnonzero(model.pair_inlier_ratios < CONSISTENT_RATIO)
+    misfit = model.pair_inlier_ratios < CONSISTENT_RATIO
+    inconsistent = np.flatnonzero(misfit | model.pairs_turned)
     registered, frames = np.unique(model.view_frames, return_inverse=True)
     cut_points, part = weakest_cut(
         model.observed_points, frames[model.observing_views], len(registered)
@@ -322,6 +327,7 @@ def model_statistics(result: MappingResult, photographs: int) -> ModelStatistics
         focal_over_prior=_focal_over_prior(model),
         pairs_checked=len(model.pairs),
         pairs_inconsistent=len(inconsistent),
+        pairs_turned=len(inconsistent) - int(misfit.sum()),
         inconsistent_pair=_names(model, model.pairs[inconsistent[0]]) if len(inconsistent) else (),
         rotation_to_other_deg=float(model.rotations_to_others_deg.max(initial=0.0)),
         cut_points=cut_points,

@@ -49,5 +49,6 @@ def orbit_model(views: int, points: int, seed: int = 0, radius: float = 4.0) -> 
         observed_px=px.reshape(-1, 2),
         pairs=pairs,
         pair_inlier_ratios=np.ones(len(pairs)),
+        pairs_turned=np.zeros(len(pairs), np.bool_),
         rotations_to_others_deg=np.empty(0),
     )

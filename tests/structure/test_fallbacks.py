@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from stages.base.stage import Report
 from stages.scene import Capture
 from stages.structure.acceptance import accepted_model, report_warnings
 from stages.structure.fallbacks import (
+    ANOTHER_START,
     CONFIGURATIONS,
     LEARNED,
     Attempt,
@@ -115,6 +117,36 @@ def test_learned_features_follow_sift_only_where_photographs_are_left_out() -> N
     assert tried(passed(9), "auto") == ["standard", "learned features"]
     assert tried(passed(9), "sift") == ["standard"]
     assert tried(passed(9), "learned") == ["learned features"]
+
+
+def checked(inconsistent: int, registered: int = 10, again: bool = False) -> Attempt:
+    """An attempt that passed, and so many of whose 100 pairs contradict it."""
+    configuration = ANOTHER_START if again else CONFIGURATIONS[0]
+    statistics = ModelStatistics(
+        photographs=10,
+        registered=registered,
+        pairs_checked=100,
+        pairs_inconsistent=inconsistent,
+        inconsistent_pair=("a.jpg", "b.jpg"),
+    )
+    return Attempt(configuration, (), statistics)
+
+
+def test_a_model_that_pairs_contradict_is_mapped_again_from_another_initial_pair() -> None:
+    assert tried(checked(7), "sift") == ["standard", "another initial pair"]
+    assert tried(checked(7), "auto") == ["standard", "another initial pair"]
+    assert tried(checked(2), "sift") == ["standard"]
+    turned = replace(checked(7).statistics, pairs_turned=5)  # no poses would change that
+    assert tried(Attempt(CONFIGURATIONS[0], (), turned), "sift") == ["standard"]
+
+
+def test_the_model_from_another_initial_pair_is_used_if_half_as_many_pairs_contradict_it() -> None:
+    standard = checked(8)
+    for inconsistent, used in ((0, True), (4, True), (5, False), (9, False)):
+        again = checked(inconsistent, registered=9, again=True)
+        assert best_attempt([standard, again]) is (again if used else standard)
+    failed = Attempt(ANOTHER_START, failing("sfm-too-few-registered"), checked(0).statistics)
+    assert best_attempt([standard, failed]) is standard
 
 
 def test_learned_features_do_not_help_against_a_lack_of_parallax() -> None:

@@ -68,6 +68,11 @@ def test_inconsistent_pairs_are_counted_and_one_is_named() -> None:
     statistics = model_statistics(result, 6)
     assert statistics.pairs_inconsistent == 2
     assert statistics.inconsistent_pair == ("02.jpg", "03.jpg")
+    assert statistics.pairs_turned == 0
+    turned = np.array([True, False, True, False, False])
+    both = replace(model, pair_inlier_ratios=fits, pairs_turned=turned)
+    statistics = model_statistics(replace(result, model=both), 6)
+    assert (statistics.pairs_inconsistent, statistics.pairs_turned) == (3, 1)
     faces = tuple(f"photos/{i}.jpg/000+25.jpg" for i in range(6))
     named = replace(result.model, names=faces) if result.model else None
     statistics = model_statistics(replace(result, model=named), 6)
