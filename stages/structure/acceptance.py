@@ -10,7 +10,7 @@ from stages.base.stage import Report
 from stages.base.text import listed
 from stages.scene import Capture
 from stages.structure.fallbacks import LEARNED, Attempt, best_attempt
-from stages.structure.gates import THRESHOLDS, borderline_failures, failure
+from stages.structure.gates import IF_RIGHT, THRESHOLDS, borderline_failures, failure
 from stages.structure.learned_weights import INSTALL, installed
 from stages.structure.sparse_model import SparseModel
 
@@ -81,7 +81,8 @@ def report_warnings(
     failed = {found.code for found in best.failures}
     for found in borderline_failures(best.statistics):
         if found.code not in failed:
-            report.warn(found.code, f"{found.given} {found.wanted} {found.hint}")
+            hint = found.hint.removesuffix(IF_RIGHT)  # the run goes on without it
+            report.warn(found.code, f"{found.given} {found.wanted} {hint}")
     for found in best.failures:
         report.warn(
             found.code, f"Accepted because of --allow-partial: {found.given} {found.wanted}"

@@ -135,6 +135,7 @@ MOVE = (
     "Walk around the scene instead of turning on the spot: every photograph should be taken from "
     "another place, a step apart."
 )
+IF_RIGHT = " If the poses are right all the same, --allow-partial goes on with them."
 
 
 def check_keypoints(counts: list[int]) -> list[SplatError]:
@@ -320,8 +321,7 @@ def _contradiction(given: str) -> SplatError:
         "Nothing may move between photographs, and no part of the scene may look like another.",
         "If the subject was turned or moved between photographs, put those before and those after "
         "into folders of their own, or hide everything else by masks; if the same picture or "
-        "pattern is there twice, hide one of the two. If the poses are right all the same, "
-        "--allow-partial goes on with them.",
+        "pattern is there twice, hide one of the two." + IF_RIGHT,
     )
 
 

@@ -187,3 +187,12 @@ def test_a_model_that_the_largest_contains_needs_no_warning(other: str) -> None:
     report = Report()
     report_warnings([attempt], model, Capture(Path(), ()), report)
     assert ("sfm-several-models" in dict(report.warnings)) == (other == "lost.jpg")
+
+
+def test_the_warning_of_a_model_that_is_used_does_not_advise_to_allow_it() -> None:
+    report = Report()
+    model = orbit_model(views=6, points=40)
+    report_warnings([checked(7)], model, Capture(Path(), ()), report)
+    warning = dict(report.warnings)["sfm-contradictions"]
+    assert "7 of 100 pairs" in warning
+    assert "--allow-partial" not in warning
