@@ -26,9 +26,8 @@ def strongest_pair(
     database: pycolmap.Database,
     verified: Sequence[tuple[tuple[int, int], NDArray[np.integer]]],
 ) -> tuple[int, int] | None:
-    """Image ids of the pair with most matches among those with enough parallax; None if there is
-    none. The faces of one panorama are no pair. verified: both image ids and the matches [N, 2] of
-    each pair."""
+    """Image ids of the pair with most matches among those with enough parallax, if there is one. The
+    faces of a panorama are no pair. verified: both image ids and matches [N, 2] of each pair."""
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed, options.ransac.max_num_trials = job.seed, _MOST_TRIALS
     options.compute_relative_pose = True
@@ -45,8 +44,8 @@ def strongest_pair(
         )
         if found.cam2_from_cam1 is None:
             continue
-        motion = found.cam2_from_cam1.translation
-        sideways = abs(motion[2]) < MOST_FORWARD * np.linalg.norm(motion)
+        move = found.cam2_from_cam1.translation
+        sideways = abs(move[2]) < MOST_FORWARD * np.linalg.norm(move)
         if sideways and np.degrees(found.tri_angle) >= LEAST_ANGLE_DEG:
             return both
     return None

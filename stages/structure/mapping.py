@@ -279,11 +279,8 @@ def _pair_inlier_ratios(
     found = np.nan_to_num(np.array(ratios, np.float64), nan=1.0)
     turned = np.zeros(len(pairs), np.bool_)
     turned[_turned_pairs(turns)] = True
-    return {
-        "pairs": np.array(pairs, np.int32).reshape(-1, 2),
-        "pair_inlier_ratios": found,
-        "pairs_turned": turned,
-    }
+    checked = np.array(pairs, np.int32).reshape(-1, 2)
+    return {"pairs": checked, "pair_inlier_ratios": found, "pairs_turned": turned}
 
 
 def _turn(

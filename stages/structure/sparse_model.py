@@ -73,9 +73,7 @@ _SAMPLED_POINTS = 4000  # every pair of rays of a point is compared, so a sample
 _SAMPLED_RAYS = 24
 FEWEST_OBSERVATIONS = 15
 IMPLAUSIBLE_SHARE = 0.1  # of the photographs
-CONSISTENT_RATIO = (
-    0.25  # of a pair's matches; pairs of a good model have 0.9 and more, false ones 0.05
-)
+CONSISTENT_RATIO = 0.25  # of a pair's matches: good models have 0.9 and more, false ones 0.05
 
 
 @dataclass(frozen=True)
