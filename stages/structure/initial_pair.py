@@ -26,8 +26,8 @@ def strongest_pair(
     database: pycolmap.Database,
     verified: Sequence[tuple[tuple[int, int], NDArray[np.integer]]],
 ) -> tuple[int, int] | None:
-    """Image ids of the pair with most matches among those with enough parallax, if there is one. The
-    faces of a panorama are no pair. verified: both image ids and matches [N, 2] of each pair."""
+    """Image ids of the pair with most matches among those with enough parallax, or None. The faces
+    of a panorama are no pair. verified: both image ids and the matches [N, 2] of each pair."""
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed, options.ransac.max_num_trials = job.seed, _MOST_TRIALS
     options.compute_relative_pose = True
