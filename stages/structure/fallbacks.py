@@ -121,8 +121,8 @@ def best_attempt(attempts: list[Attempt]) -> Attempt:
 
 
 def configurations(features: str) -> tuple[Configuration, ...]:
-    """The configurations in order. features: "sift", "auto" (learned features second) or "learned"
-    (first)."""
+    """The configurations in order. features: "sift", "auto" (learned features after the standard
+    ones) or "learned" (first)."""
     first, *others = CONFIGURATIONS
     if features == "sift":
         return (first, ANOTHER_START, *others)
