@@ -24,6 +24,7 @@ import types
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, fields, replace
 from dataclasses import field as dataclass_field
+from functools import cache
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from stages.base.errors import SplatError, UsageError
@@ -121,9 +122,12 @@ def setting(
     return dataclass_field(default=default, metadata={"help": help, **bounds, **metadata})
 
 
+_type_hints = cache(get_type_hints)  # evaluating them again for every use slows down the help
+
+
 def settings_of(settings_type: type) -> list[Setting]:
     """Every field of a settings dataclass, in order."""
-    hints = get_type_hints(settings_type)
+    hints = _type_hints(settings_type)
     found = []
     for field in fields(settings_type):
         hint, optional = hints[field.name], False
