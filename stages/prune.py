@@ -225,7 +225,7 @@ def load(folder: Path) -> Splats:
 
 STAGE = Stage(
     name="prune",
-    version=21,
+    version=22,
     reads=("sfm", "train"),
     settings_type=PruneSettings,
     run=run,

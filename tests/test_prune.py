@@ -317,7 +317,7 @@ def contributions_of(view_counts, sse_change, scene_depth=(4.0,)) -> Contributio
 
 def test_a_floater_is_close_to_a_camera_and_needed_by_few() -> None:
     """One camera at the origin that sees its scene 4 away: close is nearer than 1."""
-    scene = splats([[0, 0, 0.9], [0, 0, 1.1], [0, 0, 0.9], [0, 0.9, 0.0], [0, 0, 0.5]])
+    scene = splats([[0, 0, 0.9], [0, 0, 1.1], [0, 0, 0.9], [0.4, 0, 0.6], [0, 0, 0.5]])
     contributions = contributions_of([1, 1, 3, 2, 0], [1.0] * 5)
     assert near_camera_floaters(scene, contributions, [camera()]).tolist() == [
         True,
@@ -326,6 +326,13 @@ def test_a_floater_is_close_to_a_camera_and_needed_by_few() -> None:
         True,
         True,
     ]
+
+
+def test_a_wall_beside_or_behind_a_camera_is_no_floater() -> None:
+    """The camera of the test above stands 0.5 from a wall that two further ones see."""
+    wall = splats([[0.5, 0, -0.5], [0.5, 0, 0.0], [0.5, 0, 0.3], [0, 0, -0.5]])
+    contributions = contributions_of([2] * 4, [1.0] * 4)
+    assert not near_camera_floaters(wall, contributions, [camera()]).any()
 
 
 def test_a_camera_that_sees_nothing_solid_makes_no_floaters() -> None:

@@ -7,9 +7,9 @@ change which splats are removed.
 - `stages.training.free_space`, during training: free space is what at least two and fewer than four
   training views look past, by the depths of the seed points. It needs these depths, and removes
   what densification puts there.
-- `near_camera_floaters`, in sparsification and pruning: a splat that at most two views see, closer
-  to a camera than a quarter of the median depth that is drawn for it. It needs the views and each
-  splat's contribution to them.
+- `near_camera_floaters`, in sparsification and pruning: a splat that at most two views see, in
+  front of a camera and closer to it than a quarter of the median depth that is drawn for it. It
+  needs the views and each splat's contribution to them.
 - `splats_in_masks`, there, too: a splat that is shown only where masks ignore what is there. It
   needs the same.
 - `isolated_splats`, for a file without its views: a splat far from its neighbours, compared with
@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.blocks import reported_blocks
-from stages.measure.contribution import VISIBLE_WEIGHT, Contributions
+from stages.measure.contribution import VISIBLE_WEIGHT, Contributions, near_view_frusta
 from stages.scene import Camera, Splats
 
 NEAR_CAMERA = 0.25  # of the median depth that is drawn for that camera
@@ -37,7 +37,11 @@ _REACH = 3.0  # standard deviations: a splat that covers its neighbours is not i
 def near_camera_floaters(
     splats: Splats, contributions: Contributions, cameras: Sequence[Camera]
 ) -> NDArray[np.bool_]:
-    """Splats close to a camera that at most two views need.
+    """Splats that at most two views need, close to a camera and in its picture or just beyond its
+    edge.
+
+    What is close to a camera elsewhere is no floater: people stand beside walls, which other views
+    show.
 
     Args:
         splats: N splats.
@@ -51,7 +55,7 @@ def near_camera_floaters(
     for camera, depth in zip(cameras, contributions.scene_depth, strict=True):
         if np.isfinite(depth):
             distance = np.linalg.norm(splats.means - camera.centre, axis=1)
-            close |= distance < NEAR_CAMERA * depth
+            close |= (distance < NEAR_CAMERA * depth) & near_view_frusta(splats, [camera])
     return np.asarray(close & (contributions.view_counts <= MOST_VIEWS))
 
 
