@@ -221,6 +221,7 @@ def away_m(found: Reconstruction, taken: Sequence[int]) -> NDArray[np.float64]:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(300)
 @pytest.mark.parametrize(
     ("make", "code"),
     [
@@ -288,6 +289,7 @@ def test_a_zoom_to_a_half_that_fits_a_flat_poster_is_refused(tmp_path: Path) -> 
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(300)
 def test_two_scenes_are_separated_and_one_may_be_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
