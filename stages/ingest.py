@@ -387,4 +387,4 @@ def _report_capture(
     report.metric("near_duplicates", sum(len(group) - 1 for group in duplicates))
 
 
-STAGE = Stage(name="ingest", version=13, reads=(), settings_type=IngestSettings, run=run, load=load)
+STAGE = Stage(name="ingest", version=14, reads=(), settings_type=IngestSettings, run=run, load=load)

@@ -180,8 +180,8 @@ def _decode(image: Image.Image, data: bytes, max_side: int) -> Decoded:
     jpeg = image.format in ("JPEG", "MPO")
     if jpeg and size != stored and image.mode in ("RGB", "L"):
         image.draft(None, (2 * size[0], 2 * size[1]))  # lets the decoder average for us
-    if image.format == "HEIF":
-        exif = replace(exif, orientation=1)  # the decoder has turned the pixels already
+    if image.format in ("HEIF", "TIFF"):
+        exif = replace(exif, orientation=1)  # the decoder turns the pixels itself
     native_mode = image.mode
     basic = _resized(_basic_mode(_loaded(image, data)), size, stored)
     black, alpha = _over_black(basic)
