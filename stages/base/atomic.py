@@ -17,6 +17,7 @@ from stages.base.disk import DISK_FULL, disk_full, is_full
 from stages.base.errors import ResourceError, SplatError
 
 _PARTIAL = ".partial-"
+_NAME_BYTES = 255
 
 
 def partial_prefix() -> str:
@@ -50,7 +51,7 @@ def replacing(path: Path) -> Iterator[Path]:
     "file-not-written" if the operating system refuses the write.
     """
     path = Path(path)
-    temporary = path.with_name(partial_prefix() + path.name)
+    temporary = path.with_name(_temporary_name(path.name))
     try:
         if not path.parent.is_dir():  # checked here, because some writers would make the folder
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path.parent))
@@ -65,6 +66,18 @@ def replacing(path: Path) -> Iterator[Path]:
         # An error here must not hide the one that is being raised.
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def _temporary_name(name: str) -> str:
+    """`partial_prefix` and the name; of a very long name the checksum and the end, because file
+    systems allow `_NAME_BYTES` at most."""
+    prefix = partial_prefix()
+    if len(os.fsencode(prefix + name)) <= _NAME_BYTES:
+        return prefix + name
+    checksum = f"{zlib.crc32(os.fsencode(name)):08x}-"
+    while len(os.fsencode(prefix + checksum + name)) > _NAME_BYTES:
+        name = name[1:]
+    return prefix + checksum + name
 
 
 def write_csv(path: Path, rows: Iterable[Iterable[object]]) -> None:

@@ -38,6 +38,14 @@ def test_a_folder_that_is_not_there_is_no_error_of_its_own(tmp_path: Path) -> No
     remove_abandoned_files(tmp_path / "none")
 
 
+@pytest.mark.parametrize("name", ["n" * 251 + ".jpg", "\u00fc" * 124 + ".webp"])
+def test_names_as_long_as_file_systems_allow_are_written(tmp_path: Path, name: str) -> None:
+    with replacing(tmp_path / name) as path:
+        assert path.suffix == Path(name).suffix
+        path.write_text("a")
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
 def test_file_and_then_folder_are_flushed_to_the_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
