@@ -111,7 +111,7 @@ def _remove_masks(
 ) -> tuple[dict[str, Path], tuple[str, ...]]:
     """Remove masks from `files`: those in a folder called masks, those in `apart` if it is inside,
     and those beside their photographs. Returns masks by the photograph's name, and stray masks."""
-    apart = apart.resolve() if apart is not None else None
+    apart, photos = apart.resolve() if apart is not None else None, folder.resolve()
     inside = {
         name: name.partition("/")[2]
         for name in files
@@ -120,10 +120,15 @@ def _remove_masks(
     if len(inside) == len(files):
         inside = {}  # a folder of nothing but masks holds photographs
     found = {short: files.pop(name) for name, short in inside.items()}
-    if apart is not None and apart.is_dir() and apart != folder.resolve():
-        found |= _files_by_name(apart)
-        for name in [name for name, path in files.items() if path.resolve().is_relative_to(apart)]:
-            del files[name]
+    if apart is not None and apart.is_dir() and apart != photos:
+        every = _files_by_name(apart)
+        if photos.is_relative_to(apart):  # masks lie above the photographs, not among them
+            every = {n: p for n, p in every.items() if not p.resolve().is_relative_to(photos)}
+        else:
+            inside_it = [n for n, p in files.items() if p.resolve().is_relative_to(apart)]
+            for name in inside_it:
+                del files[name]
+        found |= every
     found = {name: path for name, path in found.items() if suffix_of(name) in masks.MASK_SUFFIXES}
     pictures = [name for name in files if suffix_of(name) in PICTURES]
     beside = masks.masks_beside(pictures)

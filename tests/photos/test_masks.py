@@ -160,6 +160,12 @@ def test_alpha_means_empty_unless_said_otherwise(photos: Path) -> None:
         np.testing.assert_array_equal(mask_of(capture), HALF)
 
 
+def test_masks_may_lie_in_a_folder_above_the_photographs(tmp_path: Path) -> None:
+    photos = folder_of(tmp_path / "capture" / "photos")
+    capture, _ = taken(photos, masks=masked(tmp_path / "capture", photos))
+    np.testing.assert_array_equal(mask_of(capture), HALF)
+
+
 def test_a_smaller_mask_is_scaled_without_blur_and_said(photos: Path, tmp_path: Path) -> None:
     folder = masked(tmp_path / "m", photos, HALF[::2, ::2])
     capture, warnings = taken(photos, masks=folder)
