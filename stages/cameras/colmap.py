@@ -113,6 +113,13 @@ def locate(path: Path) -> Path | None:
     return None
 
 
+def files(folder: Path) -> list[Path]:
+    """The files of the model that are read."""
+    stems = ("cameras", "images", "points3D")
+    names = (f"{stem}.{kind}" for stem in stems for kind in ("bin", "txt"))
+    return [folder / name for name in names if (folder / name).is_file()]
+
+
 def read(folder: Path) -> CameraFile:
     """The cameras of a model, in the order of the file; pictures are in a folder `images` near the
     model. Raises SplatError "cameras-unreadable"."""

@@ -30,8 +30,8 @@ from stages.cameras.camera_file import (
     FilePoints,
     camera_file,
     check_inside,
-    content_of,
     file_points,
+    json_of,
     poses_of,
     stored_size,
 )
@@ -117,14 +117,28 @@ def read_points(path: Path) -> FilePoints | None:
     "cameras-unreadable"."""
     with reading(path, CAMERAS):
         data = _document(path)
-        named = str(data.get("ply_file_path") or "")
-        check_inside(path.parent, named, path.parent)
-        if not named or not (path.parent / named).is_file():
-            return None
-    with reading(path.parent / named, CAMERAS):
-        points, colours = _ply_points(path.parent / named)
+        file = _file_of_points(path, data)
+    if file is None:
+        return None
+    with reading(file, CAMERAS):
+        points, colours = _ply_points(file)
         turn, shift, scale = _applied(data)
         return file_points((points / scale - shift) @ turn, colours)
+
+
+def files(path: Path) -> list[Path]:
+    """The file, and that of its points. Raises SplatError "cameras-unreadable"."""
+    with reading(path, CAMERAS):
+        points = _file_of_points(path, _document(path))
+    return [path] if points is None else [path, points]
+
+
+def _file_of_points(path: Path, data: dict[str, Any]) -> Path | None:
+    """`ply_file_path`, if the document names one that is there. Raises BadFileError if it is
+    outside the document's folder."""
+    named = str(data.get("ply_file_path") or "")
+    check_inside(path.parent, named, path.parent)
+    return path.parent / named if named and (path.parent / named).is_file() else None
 
 
 def depth_maps(path: Path) -> tuple[dict[str, Path], float]:
@@ -144,7 +158,7 @@ def depth_maps(path: Path) -> tuple[dict[str, Path], float]:
 
 
 def _document(path: Path) -> dict[str, Any]:
-    data = json.loads(content_of(path).decode("utf-8"))
+    data = json_of(path)
     if not isinstance(data, dict) or not isinstance(data.get("frames"), list):
         raise BadFileError("it has no list of frames")
     return data

@@ -25,6 +25,7 @@ from tests.cameras.drawn import (
     nerfstudio,
 )
 from tests.cameras.drawn_surveys import MADE, polycam
+from tests.cameras.models import example
 
 
 def test_every_format_of_the_table_is_drawn() -> None:
@@ -96,7 +97,16 @@ def test_nerfstudios_points_come_back_into_the_cameras_world(tmp_path: Path) -> 
     found = read_points(target)
     assert found is not None
     np.testing.assert_allclose(found.points, POINTS, atol=1e-6)
+    (tmp_path / "splats.ply").write_bytes(b"")
     assert {path.name for path in files_of(target)} == {"again.json", "again.ply"}
+
+
+def test_files_beside_a_colmap_model_are_no_part_of_it(tmp_path: Path) -> None:
+    example().write(tmp_path)
+    before = files_of(tmp_path)
+    assert {path.stem for path in before} == {"cameras", "images", "points3D"}
+    (tmp_path / "notes.txt").write_text("x")
+    assert files_of(tmp_path) == before
 
 
 def _cut(path: Path) -> None:
