@@ -79,20 +79,22 @@ def select_removal(
     Args:
         splats: N splats.
         contributions: of them to the views.
-        cameras: of these views, in the same order.
+        cameras: of all training views, in the same order.
         sse_per_parameter: the Lagrange multiplier of the rate-distortion cost.
         most: splats to remove.
         share: of the splats; so many times `SH_FACTOR` may lose SH degrees.
         change: summed squared change of the pictures that removed splats may make, as if the
             effects of single removals added up. Floaters do not count.
-        complete: whether these are all training views. If not, another may see what they do not.
+        complete: whether contributions to all training views are known. If not, other views may
+            need what these hardly see: only splats outside the region around all views are then
+            removed at any multiplier.
     """
-    seen, near = contributions.view_counts > 0, near_view_frusta(splats, list(cameras))
-    floaters = near_camera_floaters(splats, contributions, list(cameras))
-    floaters |= splats_in_masks(contributions)
-    free = floaters | (~seen & ~near)
+    seen, near = contributions.view_counts > 0, near_view_frusta(splats, cameras)
+    floaters, free = np.zeros(len(splats), bool), ~seen & ~near
     if complete:
-        free |= ~seen & near_view_frusta(splats, list(cameras), margin=0.0)
+        floaters = near_camera_floaters(splats, contributions, cameras)
+        floaters |= splats_in_masks(contributions)
+        free |= floaters | (~seen & near_view_frusta(splats, cameras, margin=0.0))
     ratio = contributions.picture_change / parameters_per_splat(splats.sh_degrees)
     ratio[(contributions.view_counts < FEW_VIEWS) & near] = np.finfo(np.float64).max
     ratio[free] = -np.inf

@@ -63,12 +63,8 @@ class Sparsification:
         if trainer.smooth:
             splats = smoothed(splats, model.smoothing)
         rows = evenly_spaced(range(len(trainer.train)), MAX_MEASURED_VIEWS)
-        cameras = [trainer.cameras[row] for row in rows]
-        background = trainer.draw_settings.background
-        views = (
-            _evaluation_view(trainer.train[row], camera, background)
-            for row, camera in zip(rows, cameras, strict=True)
-        )
+        cameras, background = list(trainer.cameras), trainer.draw_settings.background
+        views = (_evaluation_view(trainer.train[row], cameras[row], background) for row in rows)
         contributions = measure_contributions(splats, views, trainer.backend, truncation=False)
         change = contributions.sse * (10 ** (LOSS_DB / len(SHARES) / 10) - 1)
         most = int(LARGEST_ROUND * len(splats))

@@ -8,7 +8,8 @@ import pytest
 from stages.base.stage import Report
 from stages.raster.definition import RasterSettings
 from stages.raster.draw import render
-from stages.scene import TRANSPARENT, DrawSettings
+from stages.scene import TRANSPARENT, DrawSettings, evenly_spaced
+from stages.training import sparsification
 from stages.training.conversion import model_of
 from stages.training.density import AdaptiveDensity, BoundedDensity
 from stages.training.hooks import FLOATER_REMOVALS
@@ -25,8 +26,18 @@ NEAR = DrawSettings(near=0.1)
 RULE = AdaptiveDensity(10.0, 3)
 
 
-def drawn(scene):
-    return np.clip(render(scene, WHERE, RasterSettings()).image, 0, 1)
+HALF_TURN = np.diag([-1.0, 1.0, -1.0, 1.0])
+
+
+def drawn(scene, where=WHERE):
+    return np.clip(render(scene, where, RasterSettings()).image, 0, 1)
+
+
+def moved(x):
+    """The world-to-camera matrix of a camera at (x, 0, 0)."""
+    matrix = np.eye(4)
+    matrix[0, 3] = -x
+    return matrix
 
 
 def noisy(picture, noise=NOISE):
@@ -125,6 +136,38 @@ def test_between_these_steps_nothing_is_removed(tmp_path, share):
     start = cloud(100, 40, 30, degree=0)
     left = sparser(trainer(tmp_path, start), start, share)
     assert len(left) == 100
+
+
+def test_what_only_views_that_are_not_measured_show_stays(tmp_path, monkeypatch):
+    """Two of ten views look at the other side, and none of the four that are measured."""
+    monkeypatch.setattr(sparsification, "MAX_MEASURED_VIEWS", 4)
+    back = cloud(60, 40, 30, degree=0, seed=5)
+    back = replace(back, means=back.means * np.array([1, 1, -1], np.float32))
+    start, behind = join(cloud(200, 40, 30, degree=0), back), camera(40, 30, matrix=HALF_TURN)
+    measured = evenly_spaced(range(10), 4)
+    others = [k for k in range(10) if k not in measured][:2]
+    views = [
+        view_of(f"{k}", noisy(drawn(start, where)), where)
+        for k, where in ((k, behind if k in others else WHERE) for k in range(10))
+    ]
+    left = sparser(trainer(tmp_path, start, views=views), start)
+    assert (left.means[:, 2] < 0).sum() == 60
+    assert len(left) < 260
+
+
+def test_what_few_of_the_measured_views_show_is_no_floater(tmp_path, monkeypatch):
+    """A post before a wall, seen by three of ten views from a walk past it, and by one of four."""
+    monkeypatch.setattr(sparsification, "MAX_MEASURED_VIEWS", 4)
+    xs = np.arange(-1.0, 6.0, 0.25)
+    colours = np.random.default_rng(0).uniform(0, 1, (len(xs) * 4, 3))
+    places = [[x, y, 4.0] for x in xs for y in (-0.75, -0.25, 0.25, 0.75)]
+    wall = splats(places, scales=(0.2, 0.2, 0.02), opacities=0.95, rgb=colours)
+    places = [[2.4, y, 0.6] for y in np.linspace(-0.12, 0.12, 13)]
+    start = join(wall, splats(places, scales=0.015, opacities=0.95))
+    cameras = [camera(40, 30, matrix=moved(0.45 * k)) for k in range(10)]
+    views = [view_of(f"{k}", noisy(drawn(start, c), 0.05), c) for k, c in enumerate(cameras)]
+    left = sparser(trainer(tmp_path, start, views=views), start)
+    assert (left.means[:, 2] < 1).sum() == 13
 
 
 def test_splats_outside_the_bounds_stay(tmp_path):
