@@ -7,8 +7,9 @@ leaves the model as it was, and the lists are enlarged once the host knows.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -41,6 +42,8 @@ from stages.training.optimiser import (
 )
 from stages.training.step import StepInput
 from stages.training.views import Colour, Level, evened
+
+Result = TypeVar("Result")
 
 LAG = 8  # steps after which the host reads the results of a step
 SPARE = 1.5  # room for the lists, relative to the largest number so far
@@ -143,7 +146,7 @@ class GpuStep:
 
     def __init__(self, rasteriser: GpuRasteriser, lag: int | None = None) -> None:
         self.rasteriser, self.device = rasteriser, rasteriser.device
-        self._room, self._splats = 0, 0
+        self._room, self._room_splats, self._splats = 0, 0, 0
         self.skipped = torch.zeros(1, dtype=torch.int64, device=self.device)
         self._arrivals = Arrivals(
             self.device, (0 if interpreted() else LAG) if lag is None else lag
@@ -159,16 +162,32 @@ class GpuStep:
 
     def load(self, model: Model) -> None:
         """See `step.TrainingStep`."""
-        self._room = int(self._room * len(model) / max(1, self._splats))
+        if len(model):  # the empty model is loaded only to free the device's memory for a moment
+            self._room = int(self._room * len(model) / max(1, self._room_splats))
+            self._room_splats = len(model)
         self._splats, self._on_host = len(model), model  # known even if there is no room for it
-        with gpu_errors_explained(len(model)):
-            self._scene = self.rasteriser.scene(model.arrays)
-            self._smoothing = self._on_device(model.smoothing)
-            self._sh_degrees, self._own = model.sh_degrees, self._own_columns(model)
-            self._moment1, self._moment2 = map(self._on_device, (model.moment1, model.moment2))
-            self._steps = self._on_device(model.steps)
-            self._gradient_sum = self._on_device(model.gradient_sum)
-            self._gradient_count = self._on_device(model.gradient_count)
+        self._with_memory(lambda: self._load(model))
+
+    def _load(self, model: Model) -> None:
+        self._scene = self.rasteriser.scene(model.arrays)
+        self._smoothing = self._on_device(model.smoothing)
+        self._sh_degrees, self._own = model.sh_degrees, self._own_columns(model)
+        self._moment1, self._moment2 = map(self._on_device, (model.moment1, model.moment2))
+        self._steps = self._on_device(model.steps)
+        self._gradient_sum = self._on_device(model.gradient_sum)
+        self._gradient_count = self._on_device(model.gradient_count)
+
+    def _with_memory(self, work: Callable[[], Result]) -> Result:
+        """The result of `work`. If the device's memory is full, it loses its photographs, which are
+        sent again one by one as they are needed, and `work` is repeated. Raises MemoryFull."""
+        with gpu_errors_explained(len(self)):
+            try:
+                return work()
+            except torch.OutOfMemoryError:
+                if not self._targets:
+                    raise
+            self._targets.clear()  # here, because the error holds what the work had allocated
+            return work()
 
     def model(self) -> Model:
         """See `step.TrainingStep`."""
@@ -185,38 +204,47 @@ class GpuStep:
 
     def step(self, given: StepInput) -> float:
         """See `step.TrainingStep`; the loss is that of LAG steps ago."""
-        level, settings = given.level, given.settings
-        with gpu_errors_explained(len(self)):
-            known = id(level.means) in self._targets
-            view_target = self._target(level)
-            view = view_target.view(self.rasteriser, settings)
-            scene = self._drawn_scene(given.smooth, given.dropout)
-            room = self._room if known else None
-            drawn = self.rasteriser.draw(scene, view, capacity=room)
-            if room is None:  # the first step on this view waits for the device
-                room = len(drawn.lists.members)
-                self._room = max(self._room, int(SPARE * room))
-            target, means = view_target.target(drawn.image, settings.background)
-            loss, v_image = image_loss(drawn.image, target, means)
-            if given.weight != 1.0:
-                v_image *= given.weight
-            view_target.ignore_masked(v_image)
-            parameters, means2d = self.rasteriser.gradients(scene, view, drawn, v_image)
-            if self._own is not None:
-                parameters *= self._own[:, : parameters.shape[1]]
-            self._adam(drawn, view, parameters, means2d, given.rates, room)
-            self._on_host = None
-            self.skipped += drawn.lists.total > room
-            self._arrivals.send(torch.stack([loss.double(), drawn.lists.total[0].double()]))
-            value, wanted = self._arrivals.read()
+        value, wanted = self._with_memory(lambda: self._step(given))
         if wanted > self._room:
             self._room = int(SPARE * wanted)
         return value
 
+    def _step(self, given: StepInput) -> tuple[float, float]:
+        """(the loss, the number of entries of the lists) of LAG steps ago."""
+        level, settings = given.level, given.settings
+        known = id(level.means) in self._targets
+        view_target = self._target(level)
+        view = view_target.view(self.rasteriser, settings)
+        scene = self._drawn_scene(given.smooth, given.dropout)
+        room = self._room if known else None
+        drawn = self.rasteriser.draw(scene, view, capacity=room)
+        if room is None:  # the first step on this view waits for the device
+            room = len(drawn.lists.members)
+            self._room = max(self._room, int(SPARE * room))
+        target, means = view_target.target(drawn.image, settings.background)
+        loss, v_image = image_loss(drawn.image, target, means)
+        if given.weight != 1.0:
+            v_image *= given.weight
+        view_target.ignore_masked(v_image)
+        parameters, means2d = self.rasteriser.gradients(scene, view, drawn, v_image)
+        if self._own is not None:
+            parameters *= self._own[:, : parameters.shape[1]]
+        results = torch.stack([loss.double(), drawn.lists.total[0].double()])
+        self.skipped += drawn.lists.total > room
+        # last, because what needs memory may be repeated
+        self._adam(drawn, view, parameters, means2d, given.rates, room)
+        self._on_host = None
+        self._arrivals.send(results)
+        return self._arrivals.read()
+
     def draw(self, camera: Camera, settings: RasterSettings, smooth: bool) -> NDArray[np.float32]:
         """See `step.TrainingStep`."""
-        view = self.rasteriser.view(camera, settings)
-        image = self.rasteriser.draw(self._drawn_scene(smooth), view).image
+
+        def drawn() -> Tensor:
+            view = self.rasteriser.view(camera, settings)
+            return self.rasteriser.draw(self._drawn_scene(smooth), view).image
+
+        image = self._with_memory(drawn)
         return np.ascontiguousarray(_host(image[:3]).transpose(1, 2, 0))
 
     def _drawn_scene(self, smooth: bool, dropout: Dropout | None = None) -> DeviceScene:

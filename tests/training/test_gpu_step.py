@@ -11,7 +11,7 @@ import torch
 
 pytest.importorskip("triton")
 
-from stages.raster.definition import RasterSettings, splat_arrays
+from stages.raster.definition import MemoryFull, RasterSettings, splat_arrays
 from stages.raster.gpu.rasteriser import GpuRasteriser
 from stages.raster.reference_rasteriser import ReferenceRasteriser
 from stages.scene import IGNORE, TRANSPARENT
@@ -19,7 +19,7 @@ from stages.training import gpu_step
 from stages.training.dropout import Dropout
 from stages.training.gpu_step import GpuStep, image_loss
 from stages.training.loss import channel_means
-from stages.training.optimiser import LearningRates, Model, new_model
+from stages.training.optimiser import LearningRates, Model, empty_model, new_model
 from stages.training.reference_step import ReferenceStep, reference_loss
 from stages.training.step import StepInput
 from stages.training.views import Level
@@ -164,6 +164,44 @@ def test_lists_without_room_leave_the_model_as_it_was_and_get_room():
     assert made._room > 1
     made.step(StepInput(seen, SETTINGS, RATES))
     assert (made.model().steps > before.steps).any()
+
+
+@pytest.mark.slow
+def test_lists_keep_their_room_while_the_model_is_away():
+    """Rounds of removal load an empty model for a moment, because a device may not hold two."""
+    made, seen = stepper(), level()
+    made.step(StepInput(seen, SETTINGS, RATES))
+    room, model = made._room, made.model()
+    made.load(empty_model())
+    made.load(model)
+    assert made._room == room > 0
+    made.step(StepInput(seen, SETTINGS, RATES))
+    assert int(made.skipped) == 0
+
+
+def full(*given):
+    raise torch.OutOfMemoryError("CUDA out of memory")
+
+
+@pytest.mark.slow
+def test_a_full_device_loses_photographs_and_not_splats(monkeypatch):
+    """A device with room for two photographs, and four of them."""
+    photographs, send = [level(seed=seed) for seed in range(4)], gpu_step.gpu_target_of
+    order = [photographs[number] for number in (0, 1, 2, 3, 0)]
+    other, made = stepper(), stepper()
+    wanted = [other.step(StepInput(seen, SETTINGS, RATES)) for seen in order]
+    small = lambda *given: full() if len(made._targets) == 2 else send(*given)  # noqa: E731
+    monkeypatch.setattr(gpu_step, "gpu_target_of", small)
+    assert [made.step(StepInput(seen, SETTINGS, RATES)) for seen in order] == wanted
+    assert len(made) == 20
+
+
+@pytest.mark.slow
+def test_a_picture_that_does_not_fit_is_said_to_be_too_many_splats(monkeypatch):
+    made = stepper()
+    monkeypatch.setattr(made.rasteriser, "draw", full)
+    with pytest.raises(MemoryFull):
+        made.draw(camera(40, 30), SETTINGS, smooth=False)
 
 
 @pytest.mark.slow

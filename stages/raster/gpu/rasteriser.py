@@ -131,15 +131,22 @@ class GpuRasteriser:
 
     def backward(self, forward: Forward, v_image: NDArray[np.float32]) -> Backward:
         """See `definition.Rasteriser`."""
-        v = torch.from_numpy(np.ascontiguousarray(v_image)).to(self.device)
-        parameters, means2d = self.gradients(forward.scene, forward.view, forward.drawn, v)
-        rows = torch.from_numpy(forward.visible).to(self.device).long()
-        return Backward(
-            forward.visible, parameters[rows].cpu().numpy(), means2d[rows].cpu().numpy()
-        )
+        with gpu_errors_explained(len(forward.scene.rows)):
+            v = torch.from_numpy(np.ascontiguousarray(v_image)).to(self.device)
+            parameters, means2d = self.gradients(forward.scene, forward.view, forward.drawn, v)
+            rows = torch.from_numpy(forward.visible).to(self.device).long()
+            return Backward(
+                forward.visible, parameters[rows].cpu().numpy(), means2d[rows].cpu().numpy()
+            )
 
     def contributions(self, forward: Forward, residual: NDArray[np.float32]) -> NDArray[np.float64]:
         """See `definition.Rasteriser`."""
+        with gpu_errors_explained(len(forward.scene.rows)):
+            return self._contributions(forward, residual)
+
+    def _contributions(
+        self, forward: Forward, residual: NDArray[np.float32]
+    ) -> NDArray[np.float64]:
         drawn, made = forward.drawn, forward.drawn.lists
         planes = torch.from_numpy(np.ascontiguousarray(residual)).to(self.device)
         raw = torch.zeros(len(made.members), CONTRIBUTIONS, device=self.device)
