@@ -47,8 +47,9 @@ class DensityRule(Protocol):
     def cull(self, model: Model, remove_giants: bool) -> Model:
         """The model without splats that no step can improve, see `AdaptiveDensity.cull`."""
 
-    def grow(self, model: Model, budget: int) -> Model:
-        """The model with new splats, at most `budget` in all; accumulated gradients are reset."""
+    def grow(self, model: Model, budget: int, threshold: float = GRADIENT_THRESHOLD) -> Model:
+        """The model with new splats, at most `budget` in all; accumulated gradients are reset.
+        threshold: of the mean gradient by the 2D position (NDC units of the mean loss)."""
 
     def inside(self, model: Model) -> NDArray[np.bool_]:
         """[N] splats in the region that the rule densifies."""
@@ -61,12 +62,10 @@ class AdaptiveDensity:
     Args:
         extent: of the scene, world units.
         views: number of training views.
-        threshold: of the mean gradient by the 2D position (NDC units of the mean loss).
     """
 
     extent: float
     views: int
-    threshold: float = GRADIENT_THRESHOLD
 
     def cull(self, model: Model, remove_giants: bool) -> Model:
         """The model without splats that are nearly transparent or not finite, and without giants if
@@ -78,12 +77,12 @@ class AdaptiveDensity:
             keep &= np.exp(model.log_scales.max(1)) <= GIANT * self.extent
         return model.take(keep)
 
-    def grow(self, model: Model, budget: int) -> Model:
+    def grow(self, model: Model, budget: int, threshold: float = GRADIENT_THRESHOLD) -> Model:
         """The model with splats split, at most `budget` splats in all. Where the budget is short,
         splats with the largest gradients that enough views see come first. The accumulated
         gradients are reset."""
         gradient = model.gradient_sum / np.maximum(model.gradient_count, 1)
-        chosen = np.flatnonzero(gradient >= self.threshold)
+        chosen = np.flatnonzero(gradient >= threshold)
         room = max(0, budget - len(model))
         if len(chosen) > room:
             seen_by = estimated_view_counts(model.gradient_count[chosen], self.views)
@@ -120,12 +119,13 @@ class BoundedDensity:
         outer = self.rule.cull(model.take(~inside), False)
         return self.rule.cull(model.take(inside), remove_giants).joined(outer)
 
-    def grow(self, model: Model, budget: int) -> Model:
+    def grow(self, model: Model, budget: int, threshold: float = GRADIENT_THRESHOLD) -> Model:
         """See `AdaptiveDensity.grow`."""
         inside = self.inside(model)
         outer = model.take(~inside)
         outer.reset_gradients()
-        return self.rule.grow(model.take(inside), budget - len(outer)).joined(outer)
+        grown = self.rule.grow(model.take(inside), budget - len(outer), threshold)
+        return grown.joined(outer)
 
     def inside(self, model: Model) -> NDArray[np.bool_]:
         """[N] splats inside the bounds."""

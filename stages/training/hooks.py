@@ -5,7 +5,7 @@ in their order. Splats are removed by three: `FloaterRemoval`, `Densification` a
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -29,6 +29,7 @@ from stages.training.time_limit import TimeLimit
 
 if TYPE_CHECKING:
     from stages.training.trainer import Trainer
+    from stages.training.views import Level, TrainingView
 
 CHECKPOINT_SECONDS = 30.0
 EVALUATIONS = 10  # evenly spaced over the run
@@ -44,15 +45,15 @@ class StepHook(Protocol):
 
 def step_hooks(trainer: Trainer, start: Splats) -> list[StepHook]:
     """All hooks of a run that starts from `start`, in the order in which they are called."""
-    schedule = trainer.schedule
-    threshold = gradient_threshold(schedule.steps)
-    adaptive = AdaptiveDensity(schedule.extent, len(trainer.train), threshold)
+    adaptive = AdaptiveDensity(trainer.schedule.extent, len(trainer.train))
     density: DensityRule = BoundedDensity(adaptive, trainer.within) if trainer.within else adaptive
     # Of very many held-out views a part is evaluated, so that it takes less time than training.
     views = [trainer.held_out[i] for i in evaluation_subset(len(trainer.held_out))]
     time_limit = TimeLimit(trainer.seconds, trainer.most_steps)
+    # of the cameras before their refinement, which a resumed run has, too
+    free_space = known_free_space(start.means, [v.levels[-1].camera for v in trainer.train])
     return [
-        FloaterRemoval(known_free_space(start.means, trainer.cameras)),
+        FloaterRemoval(free_space),
         Densification(density),
         Sparsification(start, density),
         FinalColourRefit(),
@@ -88,7 +89,7 @@ class Densification:
             return
         model = self.density.cull(trainer.model, schedule.removes_giants(step - 1))
         budget = min(schedule.budget(step - 1, trainer.cap), trainer.cap)  # the cap may have fallen
-        model = self.density.grow(model, budget)
+        model = self.density.grow(model, budget, gradient_threshold(schedule.steps))
         trainer.replace_model(model.take(morton.morton_order_of(model.means)))
 
 
@@ -105,10 +106,15 @@ class FinalColourRefit:
         refit = ColourRefit(
             rasteriser_of(backend_of(trainer.backend).name),
             trainer.raster_settings(trainer.schedule.sh_degree),
-            lambda: (view.levels[-1] for view in trainer.train),
+            lambda: map(_level_with_camera, trainer.train, trainer.cameras),
             trainer.smooth,
         )
         trainer.stepper.load(refit.of(model))
+
+
+def _level_with_camera(view: TrainingView, camera: Camera) -> Level:
+    """The view at full size, with its refined camera."""
+    return replace(view.levels[-1], camera=camera)
 
 
 @dataclass(frozen=True)

@@ -5,14 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from stages.base.stage import Report
 from stages.raster.cpu.rasteriser import CpuRasteriser
 from stages.raster.definition import RasterSettings, splat_arrays
-from stages.scene import IGNORE, look_at
+from stages.scene import IGNORE, DrawSettings, look_at
+from stages.training.camera_refinement import CameraRefinement
 from stages.training.colour_refit import ColourRefit
+from stages.training.conversion import model_of
+from stages.training.hooks import FinalColourRefit
 from stages.training.loss import channel_means
 from stages.training.optimiser import Model, new_model
+from stages.training.schedule import Schedule
+from stages.training.trainer import Trainer
 from stages.training.views import Level
 from tests.scenes import camera, cloud
+from tests.training.pictures import view_of
 
 SETTINGS = RasterSettings(sh_degree=1)
 NO_WIDTHS = np.zeros(0, np.float32)
@@ -95,6 +102,28 @@ def test_ignored_regions_have_no_influence(truth):
         for level in pictures_of(truth)
     ]
     np.testing.assert_array_equal(refitted(paler(truth), levels).sh, paler(truth).sh)
+
+
+def test_the_last_refit_is_to_the_refined_cameras(tmp_path, monkeypatch):
+    refinement = CameraRefinement.of({name: camera(40, 30) for name in "abc"}, 10.0)
+    refinement.poses[:, 0, 3] = 0.5
+    views = [view_of(name, np.zeros((30, 40, 3)), camera(40, 30)) for name in "abc"]
+    start = cloud(50, 40, 30, degree=0)
+    made = Trainer(
+        *(Schedule(100, 10.0, 0, 50, 0), views, [], DrawSettings(near=0.1), 50, tmp_path, Report()),
+        backend="cpu",
+        refinement=refinement,
+    )
+    made.stepper.load(model_of(start))
+    seen: list[float] = []
+
+    def refit(self, model):
+        seen.extend(level.camera.world_to_camera[0, 3] for level in self.levels())
+        return model
+
+    monkeypatch.setattr(ColourRefit, "of", refit)
+    FinalColourRefit().after_step(made, 100)
+    assert seen == [0.5, 0.5, 0.5]
 
 
 def test_no_photograph_leaves_colours_as_they_are(truth):

@@ -4,12 +4,19 @@ import numpy as np
 import pytest
 
 from stages.base.stage import Report
+from stages.scene import DrawSettings
 from stages.train import TrainSettings
 from stages.training.build import make_trainer
+from stages.training.conversion import model_of
+from stages.training.density import AdaptiveDensity, gradient_threshold
+from stages.training.hooks import step_hooks
 from stages.training.optimiser import LearningRates
 from stages.training.schedule import RATE_DECAY_END, RATES_POWER, SCALES, Schedule
 from stages.training.time_limit import TimeLimit
+from stages.training.trainer import Trainer
+from tests.scenes import camera, cloud
 from tests.small_scene import small_scene
+from tests.training.pictures import view_of
 
 PARTS = ((0, 600), (600, 1500), (1500, 3000))  # steps before, while and after the model grows
 
@@ -88,6 +95,31 @@ def test_a_changed_plan_goes_on_from_where_the_run_is_and_ends_at_its_end():
     assert plan.share(600) == 1.0
     again = schedule(1000).as_planned(plan.steps, *plan.since)
     assert again == plan
+
+
+def test_densification_takes_the_threshold_of_the_plan(tmp_path, monkeypatch):
+    """With a time limit the number of steps is only known once some have been timed."""
+    thresholds = []
+
+    def grow(self, model, budget, threshold):
+        thresholds.append(threshold)
+        return model
+
+    monkeypatch.setattr(AdaptiveDensity, "grow", grow)
+    start = cloud(50, 40, 30, degree=0)
+    view = view_of("a", np.zeros((30, 40, 3)), camera(40, 30))
+    made = Trainer(
+        *(Schedule(7000, 10.0, 0, 50, 0), [view] * 3, [], DrawSettings(near=0.1), 50, tmp_path),
+        Report(),
+        backend="cpu",
+    )
+    made.stepper.load(model_of(start))
+    densification = step_hooks(made, start)[1]
+    for steps in (7000, 28_000, 2000):
+        made.schedule = made.schedule.replanned(50, steps)
+        densify_at = next(s for s in range(51, steps) if made.schedule.densifies_after(s - 1))
+        densification.after_step(made, densify_at)
+    assert thresholds == [gradient_threshold(steps) for steps in (7000, 28_000, 2000)]
 
 
 def test_pictures_are_as_planned_to_the_very_end_of_any_plan():
