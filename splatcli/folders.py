@@ -28,7 +28,7 @@ def find_run_folder(named: Path | None = None) -> Path:
     here = Path()
     if runfolder.is_run_folder(here):
         return here
-    every = sorted(path for path in here.iterdir() if runfolder.is_run_folder(path))
+    every = sorted(path for path in here.iterdir() if _is_readable_run_folder(path))
     found = [path for path in every if runfolder.has_finished_work(path)] or every
     if DEFAULT in found:
         return DEFAULT
@@ -47,6 +47,13 @@ def find_run_folder(named: Path | None = None) -> Path:
         wanted="A run folder, named or in the current folder.",
         hint="Start one with `splat process PHOTOS`, or name one that exists.",
     )
+
+
+def _is_readable_run_folder(path: Path) -> bool:
+    try:
+        return runfolder.is_run_folder(path)
+    except PermissionError:
+        return False
 
 
 def load_target(

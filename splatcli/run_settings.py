@@ -12,6 +12,8 @@ from splatcli import console, options
 from stages import STAGE_NAMES, load_stage
 from stages.base.settings import Setting, changed, settings_of
 from stages.raster.backends import backend_of, backend_of_settings
+from stages.run.pipeline import Pipeline
+from stages.run.runfolder import is_run_folder
 
 DEFAULT_PRESET = "standard"
 
@@ -96,6 +98,14 @@ def defaults() -> dict[str, Any]:
     """Settings by stage name, with the default preset."""
     fresh = {name: load_stage(name).settings_type() for name in STAGE_NAMES}
     return {**fresh, "train": presets()[DEFAULT_PRESET]}
+
+
+def recorded(pipeline: Pipeline) -> dict[str, Any]:
+    """Settings by stage name that the run folder records; of a stage without, and of a new run
+    folder, the defaults. Raises SplatError."""
+    if not is_run_folder(pipeline.run_folder):
+        return defaults()
+    return pipeline.recorded_settings(defaults())
 
 
 def combined(

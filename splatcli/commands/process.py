@@ -40,12 +40,12 @@ def process(
     pipeline = distribute(Pipeline(run_folder, photos), cluster)
     given = options.given_only(given)
     view, preset = given.pop("view", False), given.pop("preset", None)
-    base = run_settings.defaults() if photos is not None else pipeline.recorded_settings()
-    settings = run_settings.combined(base, given, preset)
-    if "cameras" in given:  # errors of the file now, before the photographs are read
-        sfm = settings["sfm"]
+    is_known = runfolder.is_run_folder(run_folder)
+    settings = run_settings.combined(run_settings.recorded(pipeline), given, preset)
+    sfm = settings["sfm"]
+    if "cameras" in given and sfm.cameras:  # errors of the file now, before photographs are read
         check_split(read_cameras(sfm.cameras), sfm.split)
-    if photos is None and console.mode.has_notes:
+    if is_known and console.mode.has_notes:
         console.note(run_settings.training_summary(settings["train"], given, preset))
     _run(pipeline, settings, view=view)
 
@@ -87,7 +87,7 @@ def _run_stage(name: str, pipeline: Pipeline, given: Mapping[str, Any]) -> None:
     """One stage, with the recorded settings and the given options. The stages after training take
     little time: those that are missing in between run too."""
     is_known = runfolder.is_run_folder(pipeline.run_folder)
-    base = pipeline.recorded_settings() if is_known else run_settings.defaults()
+    base = run_settings.recorded(pipeline)
     given = options.given_only(given)
     preset, view = given.pop("preset", None), given.pop("view", False)
     if "formats" in given:

@@ -35,6 +35,9 @@ PANELS = (
 )
 
 
+UNSET = object()  # a value that was taken back: the field gets its default
+
+
 @dataclass(frozen=True)
 class Setting:
     """One setting and its bounds.
@@ -74,7 +77,10 @@ class Setting:
             raise self._refused("with nothing")
 
     def parse(self, text: str) -> Any:
-        """One value from its text. Raises SplatError "option-value"."""
+        """One value from its text; `UNSET` for an empty text where there may be no value. Raises
+        SplatError "option-value"."""
+        if not text and self.optional:
+            return UNSET
         try:
             value = self.kind(text)
         except ValueError:
@@ -171,7 +177,9 @@ def check_settings(settings: Any) -> None:
 
 def changed(settings: Any, typed: Mapping[str, Any]) -> Any:
     """`settings` with the typed fields that it has, checked. Raises as `check_settings`."""
-    names = {field.name for field in fields(settings)}
-    new = replace(settings, **{name: value for name, value in typed.items() if name in names})
+    defaults = {field.name: field.default for field in fields(settings)}
+    values = {name: value for name, value in typed.items() if name in defaults}
+    values |= {name: defaults[name] for name, value in values.items() if value is UNSET}
+    new = replace(settings, **values)
     check_settings(new)
     return new

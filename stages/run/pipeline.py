@@ -8,6 +8,7 @@ those after them.
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
@@ -16,7 +17,7 @@ from threading import Event
 from typing import Any
 
 from stages import STAGE_NAMES, load_stage
-from stages.base.errors import Interrupted, RunFolderError, SplatError, UsageError
+from stages.base.errors import Family, Interrupted, RunFolderError, SplatError, UsageError
 from stages.base.interrupt import stop_on_signals
 from stages.base.settings import check_settings
 from stages.base.stage import Stage
@@ -68,9 +69,11 @@ class Pipeline:
             raise self._not_finished(name, f"{name} has not finished")
         return self.layout.stage(name).load(self.stage_folder(name))
 
-    def recorded_settings(self) -> dict[str, Any]:
-        """Settings by stage name, as last requested; defaults otherwise."""
-        return (RunFile.read(self.run_folder) or RunFile()).settings_of(self.layout.stages)
+    def recorded_settings(self, otherwise: Mapping[str, Any] | None = None) -> dict[str, Any]:
+        """Settings by stage name, as last requested; of a stage that has none recorded those in
+        `otherwise`, by default the stage's own defaults."""
+        recorded = RunFile.read(self.run_folder) or RunFile()
+        return recorded.settings_of(self.layout.stages, otherwise)
 
     def recorded_photos(self) -> Path | None:
         """The photographs that the run folder records."""
@@ -128,8 +131,8 @@ class Pipeline:
         """Run what has to run, up to and including the stage `until`.
 
         Args:
-            settings: dataclasses by stage name; recorded for later runs. The recorded ones are
-                used where left out.
+            settings: dataclasses by stage name; recorded for later runs, except those of a stage
+                that refuses them or its inputs. The recorded ones are used where left out.
             until: name of the last stage; None for all, which share a limit of time.
             may_run: names of the stages that may run; it is an error if another one has to.
             listener: receives the events of the run.
@@ -149,34 +152,52 @@ class Pipeline:
             ):
                 for stage in self.layout.stages:
                     self.layout.workspace(stage).recover()
-                run_file = runfolder.recorded_for(self.run_folder, self.photos, first)
-                run_file = run_file.updated(settings or {})
+                before = runfolder.recorded_for(self.run_folder, self.photos, first)
+                run_file = before.updated(settings or {})
                 wanted = run_file.settings_of(self.layout.stages)
                 for recorded in wanted.values():
                     check_settings(recorded)
                 planner = Planner(self.layout, run_file.photographs, wanted)
                 self._check_allowed(planner, until, may_run)
                 run_file.write(self.run_folder)
-                return self._run_all(planner, until, stop, listener)
+                return self._run_all(
+                    planner,
+                    until,
+                    stop,
+                    listener,
+                    lambda name: run_file.with_settings_from(before, name).write(self.run_folder),
+                )
         except OSError as error:
             raise self._unusable(error) from error
         finally:
             listener.ended()
 
     def _run_all(
-        self, planner: Planner, until: str | None, stop: Event, listener: Listener
+        self,
+        planner: Planner,
+        until: str | None,
+        stop: Event,
+        listener: Listener,
+        forget: Callable[[str], None],
     ) -> list[Manifest]:
+        """forget: records the settings of a stage as they were before, given its name: otherwise a
+        command without the refused option would fail as well."""
         manifests, began = [], time.monotonic() if until is None else None
         for stage in self.layout.up_to(until):
-            step = planner.assess(stage)
-            if step.will_run or step.manifest is None:
-                if stop.is_set():
-                    raise Interrupted(stage.name)
-                manifest = self._run_one(planner, step, stop, listener, began)
-                listener.finished(stage, step.number, manifest)
-            else:
-                manifest = step.manifest
-                listener.skipped(stage, step.number, manifest)
+            try:
+                step = planner.assess(stage)
+                if step.will_run or step.manifest is None:
+                    if stop.is_set():
+                        raise Interrupted(stage.name)
+                    manifest = self._run_one(planner, step, stop, listener, began)
+                    listener.finished(stage, step.number, manifest)
+                else:
+                    manifest = step.manifest
+                    listener.skipped(stage, step.number, manifest)
+            except SplatError as error:
+                if error.family in (Family.USAGE, Family.INPUT):
+                    forget(stage.name)
+                raise
             planner.learn(stage, manifest)
             manifests.append(manifest)
         return manifests
@@ -211,11 +232,13 @@ class Pipeline:
                 raise self._not_finished(step.stage.name, what)
 
     def _not_finished(self, name: str, what: str) -> SplatError:
+        folder = shlex.quote(str(self.run_folder))
         return UsageError(
             "stage-not-finished",
             given=f"In {self.run_folder}, {what}.",
             wanted="Every earlier stage finished and unchanged.",
-            hint=f"Run `splat {name}` first, or `splat process` for everything that is missing.",
+            hint=f"Run `splat {name} {folder}` first, or `splat process {folder}` for everything "
+            "that is missing.",
         )
 
     def _unusable(self, error: OSError) -> SplatError:

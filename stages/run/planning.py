@@ -99,8 +99,8 @@ class Planner:
 
     def _files(self, stage: Stage, settings: Any) -> dict[str, FileRecords]:
         """Records of the user's own files that the stage reads, by input: photographs, masks, depth
-        maps, and files that settings name. Named files and those beside the photographs that were
-        removed after the stage finished count as unchanged."""
+        maps, and files that settings name. Named files that were removed after the stage finished
+        count as unchanged."""
         from stages.cameras.table import files_of
         from stages.photos import depth_files
         from stages.photos.masks import mask_folder
@@ -122,10 +122,16 @@ class Planner:
             if name in known and not path.exists():
                 found[name] = known[name]
                 continue
-            if name == DEPTH:
-                files = depth_files.files_of(path)
-            else:
-                files = [path] if name in (MASKS, RIG_MASK) else files_of(path)
+            try:
+                if name == DEPTH:
+                    files = depth_files.files_of(path)
+                else:
+                    files = [path] if name in (MASKS, RIG_MASK) else files_of(path)
+            except SplatError:  # a folder that lost the files that made it one of cameras
+                if name not in known:
+                    raise
+                found[name] = known[name]
+                continue
             found[name] = {}
             for file in files:  # maps of depth and of confidence have the same names
                 lead = f"{file.name}/" if file.name == depth_files.CONFIDENCE else ""

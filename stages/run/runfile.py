@@ -62,12 +62,24 @@ class RunFile:
         changed = {name: settings_to_data(value) for name, value in settings.items()}
         return RunFile(self.photographs, {**self.settings, **changed})
 
-    def settings_of(self, stages: Sequence[Stage]) -> dict[str, Any]:
-        """Settings dataclasses of all stages: as recorded, otherwise the defaults."""
-        return {
-            stage.name: settings_from_data(stage.settings_type, self.settings.get(stage.name, {}))
-            for stage in stages
-        }
+    def with_settings_from(self, other: RunFile, stage: str) -> RunFile:
+        """With the settings of one stage as `other` has them."""
+        settings = {name: value for name, value in self.settings.items() if name != stage}
+        if stage in other.settings:
+            settings[stage] = other.settings[stage]
+        return RunFile(self.photographs, settings)
+
+    def settings_of(
+        self, stages: Sequence[Stage], otherwise: Mapping[str, Any] | None = None
+    ) -> dict[str, Any]:
+        """Settings dataclasses of all stages: as recorded, else those in `otherwise`, else the
+        defaults of the stage."""
+        found = dict(otherwise or {})
+        for stage in stages:
+            recorded = self.settings.get(stage.name, {})
+            if recorded or stage.name not in found:
+                found[stage.name] = settings_from_data(stage.settings_type, recorded)
+        return found
 
 
 def holds_stages(folder: Path) -> bool:

@@ -66,6 +66,8 @@ def recorded_for(folder: Path, photos: Path | None, first_stage_folder: Path) ->
     if photos is None or recorded.photographs == photos:
         return recorded
     moved = recorded.photographs is not None and not recorded.photographs.exists()
+    if recorded.photographs is not None and not moved and recorded.photographs.samefile(photos):
+        return recorded  # through a link, or with `..` in its path
     if has_finished_work(folder) and not moved and not _same(photos, first_stage_folder):
         before = recorded.photographs or "other photographs"
         raise RunFolderError(

@@ -264,7 +264,7 @@ def _check_poses(out: Path, report: Report, allow_partial: bool) -> None:
         "cameras-do-not-fit",
         given=f"Only {ratio:.0%} of the matches between two photographs fit the file's cameras.",
         wanted=f"At least {INLIER_RATIO:.0%}, as cameras of these photographs have.",
-        hint=f"{likely} --allow-partial goes on all the same; without --cameras, splat finds "
+        hint=f"{likely} --allow-partial goes on all the same; with --cameras '' splat finds "
         "cameras itself.",
     )
     if not allow_partial:

@@ -338,6 +338,42 @@ def test_training_that_goes_on_says_which_settings_it_keeps(splat) -> None:
     assert "steps 7,000, train side 800, SH degree 2, max splats 250,000 (preset stan" in other
 
 
+def test_naming_the_photographs_again_keeps_earlier_options(splat) -> None:
+    splat("ingest", "photos", "--max-side", "100")
+    splat("process", "photos", "--preset", "best")
+    again = splat("process", "photos", "--json", "--format", "spz")
+    assert started(again) == ["quantise", "export"]
+
+
+def test_an_empty_value_takes_an_option_with_a_file_back(splat) -> None:
+    Path("m").mkdir()
+    splat("process", "photos", "--masks", "m")
+    again = splat("process", "photos", "--masks", "", "--json")
+    assert started(again)[0] == "ingest"
+    assert "masks" in events(again)[0]["reason"]
+    assert started(splat("process", "--json")) == []
+
+
+def test_a_rebuilt_run_file_takes_the_default_preset_for_training(splat) -> None:
+    splat("ingest", "photos")
+    Path("run/run.json").unlink()
+    assert "max splats 250,000" in splat("process", "photos").stderr
+
+
+def test_folders_that_may_not_be_read_hide_no_run_folder(splat, monkeypatch) -> None:
+    splat("process", "photos", "--out", "mine")
+    Path("locked").mkdir()
+    is_file = Path.is_file
+
+    def refuse(path: Path) -> bool:
+        if path.parent.name == "locked":
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return is_file(path)
+
+    monkeypatch.setattr(Path, "is_file", refuse)
+    assert splat("status").exit_code == 0
+
+
 def test_every_splat_error_shows_given_wanted_next_and_code(splat, pretend) -> None:
     def refuse(inputs, settings, folder, report) -> None:
         raise SplatError("ingest-x", given="Two cats.", wanted="A dog.", hint="Bark [loudly].")

@@ -647,6 +647,34 @@ def test_failing_stage_keeps_the_old_finished_work(finished: Pipeline, run_folde
     assert "iterations 7000 -> 1" in reasons(finished)["count"]
 
 
+@pytest.mark.parametrize(
+    ("family", "recorded"),
+    [(Family.USAGE, 7000), (Family.INPUT, 7000), (Family.RESOURCES, 1), (Family.RUN_FOLDER, 1)],
+)
+def test_settings_that_a_stage_refuses_are_not_recorded(
+    finished: Pipeline, run_folder: Path, family: Family, recorded: int
+) -> None:
+    error = SplatError("count-x", given="1.", wanted="2.", hint="3.", family=family)
+    refusing = Pipeline(run_folder, stages=fake_stages(count=failing(error)))
+    with pytest.raises(SplatError):
+        refusing.run({"copy": CopySettings(threads=2), "count": CountSettings(iterations=1)})
+    settings = finished.recorded_settings()
+    assert settings["count"].iterations == recorded
+    assert settings["copy"].threads == 2
+
+
+def test_photographs_under_another_spelling_are_the_same(
+    finished: Pipeline, photos: Path, run_folder: Path
+) -> None:
+    (photos / "c.jpg").write_text("three")
+    link = photos.parent / "link"
+    link.symlink_to(photos)
+    for spelling in (photos.parent / "run" / ".." / "photos", link):
+        Pipeline(run_folder, spelling, fake_stages()).run()
+        assert finished.recorded_photos() == photos
+    assert finished.load("copy") == "onetwothree"
+
+
 def checkpointing(total: int, stop_after: int):
     """Adds a letter at a time to a checkpoint; stops after some, once."""
 
