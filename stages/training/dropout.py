@@ -4,7 +4,9 @@ et al. 2025, "DropGaussian").
 With few training views, fine splats overfit: they match the pixels of those views and appear as
 needles and fog from everywhere else. With dropout, neighbouring splats learn to replace each other.
 The dropout probability of a splat that n training views see is (2 / n)^2, at most 0.3: splats that
-many views see are hardly ever dropped.
+many views see are hardly ever dropped. n is estimated from the steps in which the splat was drawn,
+so it falls for a splat that was dropped: of 12 views, 5 should give 0.16 and give 0.29 in the end.
+The gains in docs/experiments/overfitting.md were measured like this.
 
 Neighbours overlap, so what one dropped splat leaves is drawn by those around it. `NEIGHBOURHOOD`
 consecutive splats therefore share a random number (Fang et al. 2026, "DropAnSH-GS"): the splats are
