@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
+from pkgutil import resolve_name
 
 from stages.base.errors import UsageError
 
@@ -40,6 +41,8 @@ class Format:
         holds_origin: whether a file holds the origin of a georeferenced scene; else it is written
             beside, see `stages.formats.offset`.
         sidecar: the suffix of a file beside it that belongs to it; "" if there is none.
+        parts: (path) -> the files that the file at `path` names, by relative name; "" if it names
+            none.
         takes_views: whether the file also holds cameras.
         needs_finetuning: whether rounding is so coarse that splats are fine-tuned to it.
         drawn_antialiased: whether programs that the format is for draw it with opacity
@@ -62,6 +65,7 @@ class Format:
     y_up: bool = False
     holds_origin: bool = True
     sidecar: str = ""
+    parts: str = ""
     takes_views: bool = False
     needs_finetuning: bool = False
     drawn_antialiased: bool = False
@@ -82,12 +86,13 @@ class Format:
         return self.ending if self.streamed else f"{stem}.{self.ending}"
 
     def files(self, path: Path) -> list[Path]:
-        """`path` and the files beside it that belong to it."""
+        """`path` and the files beside it that belong to it. Raises SplatError "splats-unreadable"
+        if the asset has parts and does not name them."""
         page = path.with_suffix(self.sidecar) if self.sidecar else path
         beside = [path, page] if page != path and page.is_file() else [path]
-        if self.streamed:
-            candidates = sorted(path.parent.glob("*_*/*"))
-            return [*beside, *(file for file in candidates if CHUNK_FOLDER.match(file.parent.name))]
+        if self.parts:
+            chunks = set(resolve_name(self.parts)(path).values()) - set(beside)
+            return [*beside, *sorted(chunks)]
         return beside
 
     def size_bytes(self, path: Path) -> int:
@@ -95,7 +100,6 @@ class Format:
         return sum(file.stat().st_size for file in self.files(path))
 
 
-CHUNK_FOLDER = re.compile(r"[0-9]+_[0-9]+$")  # folders of a streamed asset: level, number
 _MESH = re.compile(r"\.mesh\.(glb|ply)$")  # of the names of meshes
 
 _GLB = Format(
@@ -193,6 +197,7 @@ TABLE = (
         order="stages.formats.streamed_sog:order",
         loses="has 256 sizes and colours, and a palette of view-dependent colours",
         sidecar=".html",
+        parts="stages.formats.streamed_sog:parts_of",
         takes_views=True,
         streamed=True,
     ),
