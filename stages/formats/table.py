@@ -34,6 +34,8 @@ class Format:
             repeated values; "" for the others.
         position_loss: (splats) -> what far splats do to the positions, as the end of "the file
             ...", or ""; "" for formats in which they do nothing.
+        size_loss: (splats) -> what happens to splats that are too small, as the end of "the file
+            ...", or ""; "" for formats that hold all sizes.
         loses: what of the splats changes, as the end of "the format ..."; "" if every value comes
             back as float32.
         sh_degree: the highest SH degree that is kept.
@@ -60,6 +62,7 @@ class Format:
     order: str = ""
     quantiser: str = ""
     position_loss: str = ""
+    size_loss: str = ""
     loses: str = ""
     sh_degree: int = 3
     y_up: bool = False
@@ -170,6 +173,7 @@ TABLE = (
         writer="stages.formats.spz:write",
         reader="stages.formats.spz_read:read",
         position_loss="stages.formats.spz:position_loss",
+        size_loss="stages.formats.spz:size_loss",
         holds_origin=False,
         loses="has sizes in steps of 6 %, 8-bit colours and view-dependent colour of 4 and 5 bits",
         needs_finetuning=True,

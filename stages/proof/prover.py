@@ -23,6 +23,7 @@ from stages.base.errors import QualityError
 from stages.base.text import counted, reason_of
 from stages.formats import BY_ENDING, Format, format_of
 from stages.formats.compressed_ply import outlier_shells
+from stages.formats.losses import ENLARGE
 from stages.formats.values import check_finite, drop_undrawable, nonfinite_allowed
 from stages.measure.image_metrics import IDENTICAL_DB, capped_psnr_db
 from stages.proof import checks, diagnosis
@@ -118,7 +119,9 @@ class Prover:
                 code,
                 given=f"{path} came out wrong: {proof.fault}.",
                 wanted="A file that another program reads as the same splats.",
-                hint="Write another format, and report this with the file that was read.",
+                hint=f"{ENLARGE}."
+                if _size_loss(format_of(path), self.splats)
+                else "Write another format, and report this with the file that was read.",
             )
         return proof
 
@@ -171,6 +174,8 @@ class Prover:
             "worst_splat": found.worst_row,
         }
         fault = diagnosis.explain(self.splats, content, found)
+        if "log_scale" in found.wrong and (loss := _size_loss(BY_ENDING[names[0]], self.splats)):
+            fault = f"{fault} (the format {loss})"
         if not lossy and worst < _MIN_LOSSLESS_DB:
             drawn = f"drawn again it differs by {worst:.1f} dB"
             fault = f"{drawn}; {fault}" if fault else drawn
@@ -226,6 +231,10 @@ def _drawable(content: FileContent) -> FileContent:
     readers."""
     with nonfinite_allowed():
         return replace(content, splats=drop_undrawable(check_finite(content.splats))[0])
+
+
+def _size_loss(row: Format, splats: Splats) -> str:
+    return resolve_name(row.size_loss)(splats) if row.size_loss else ""
 
 
 _DROP = "`splat edit --drop-floaters` removes outliers"

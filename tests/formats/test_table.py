@@ -18,7 +18,7 @@ from stages.surface.table import MESHES, MeshFormat
 from tests.formats.files import read
 from tests.formats.truth import many_splats
 
-PLACES = ("writer", "reader", "independent_reader", "order", "quantiser", "position_loss", "parts")
+PLACES = "writer reader independent_reader order quantiser position_loss size_loss parts".split()
 ROWS: list[Format | MeshFormat] = [*BY_ENDING.values(), *MESHES.values()]
 
 

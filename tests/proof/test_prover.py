@@ -11,7 +11,10 @@ import pytest
 from plyfile import PlyData
 
 from stages import formats
+from stages.base.errors import SplatError
 from stages.formats import splat32
+from stages.formats.losses import losses_of
+from stages.formats.values import check_finite
 from stages.proof import independent_readers
 from stages.proof import prover as proving
 from stages.proof.checks import read_back
@@ -235,6 +238,31 @@ def test_flat_and_opaque_splats_are_numbers_to_both_readers(
     assert proof.fault == ""
     assert proof.splats == len(scene.splats)
     assert proof.figures["max_log_scale_error"] == 0
+
+
+@pytest.mark.parametrize("name", ["spz", "sog", "compressed.ply", "quantised.glb"])
+@pytest.mark.parametrize("thickness", [-16.0, -np.inf])
+def test_an_axis_too_thin_for_a_format_is_no_fault(
+    prover: Prover, scene: SmallScene, tmp_path: Path, name: str, thickness: float
+) -> None:
+    logs = scene.splats.log_scales.copy()
+    logs[:, 2] = thickness
+    flat = check_finite(replace(scene.splats, log_scales=logs))
+    found = written(Prover.of(flat, prover.cameras), tmp_path, name, flat)
+    assert found.fault == ""
+    assert found.figures["verify_db"] > 30
+
+
+def test_splats_smaller_than_a_format_holds_are_named_with_its_limit(
+    scene: SmallScene, tmp_path: Path
+) -> None:
+    tiny = scene.splats
+    tiny = replace(tiny, means=tiny.means / 1e4, log_scales=tiny.log_scales - np.log(1e4))
+    formats.write(tmp_path / "a.spz", tiny)
+    with pytest.raises(SplatError, match=r"holds sizes from 4\.5e-05 units") as wrong:
+        Prover.of(tiny, cameras_for(tiny)).require(tmp_path / "a.spz", "wrong")
+    assert "--scale" in wrong.value.hint
+    assert "4.5e-05" in losses_of(formats.BY_ENDING["spz"], "a.spz", tiny)["size"]
 
 
 def test_without_photographs_the_middle_of_the_splats_is_seen_from_three_sides(
