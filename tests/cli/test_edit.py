@@ -122,6 +122,7 @@ def test_a_dry_run_reports_the_removal_and_writes_nothing(source: Path, tmp_path
     assert f"--keep x > 0: 300 -> {kept} splats" in err
     assert f"--decimate 10: {kept} -> 10 splats" in err
     assert "Nothing was written" in err
+    edited(source, tmp_path / "new" / "x.spz", "--max-mb", "0.002", "--dry-run")
     assert sorted(tmp_path.iterdir()) == before
 
 

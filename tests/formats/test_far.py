@@ -140,6 +140,15 @@ def test_a_damaged_place_is_an_error(tmp_path: Path, damage: dict[str, Any]) -> 
     assert raised.value.code == "splats-unreadable"
 
 
+@pytest.mark.parametrize("content", ["[]", "5", '{"offset": {}}'])
+def test_a_damaged_offset_is_an_error(tmp_path: Path, content: str) -> None:
+    formats.write(tmp_path / "a.spz", replace(many_splats(5), origin=UTM))
+    (tmp_path / "a.spz.offset.json").write_text(content)
+    with pytest.raises(SplatError) as raised:
+        formats.read(tmp_path / "a.spz")
+    assert raised.value.code == "splats-unreadable"
+
+
 def test_what_lies_near_zero_is_left_where_it_is() -> None:
     means = many_splats(50).means.astype(np.float64) + np.array([900, -20, 3])
     near, origin = recentred(means, np.array([1.0, 2.0, 3.0]))

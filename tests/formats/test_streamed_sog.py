@@ -199,6 +199,7 @@ def lod(meta: dict[str, Any]) -> dict[str, Any]:
         lambda meta: lod(meta).update(count=10**9),
         lambda meta: lod(meta).update(count="many"),
         lambda meta: lod(meta).pop("offset"),
+        lambda meta: leaves(meta)[0]["lods"].update({"0": 5}),
         lambda meta: leaves(meta)[0]["lods"].update(first={}),
         lambda meta: meta["tree"]["children"].append(meta["tree"]["children"][0]),
         lambda meta: meta["tree"].update(children=[3]),
