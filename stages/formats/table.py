@@ -28,6 +28,8 @@ class Format:
         writer: (path, splats, *, units), with drawable splats. It also takes `views` if
             `takes_views`, and `coarser` if `streamed`.
         reader: (path) -> Splats, y down; raises BadFileError, or what damaged bytes cause.
+        units: (path) -> the units that a file declares, or ""; raises as `reader`. "" for formats
+            whose files declare them in text at their start, or not at all.
         order: (splats) -> [N] the row of `splats` that each row of the file comes from; "" if the
             format keeps the order.
         quantiser: (splats, bit depths) -> Splats on coarser grids, for a format that compresses
@@ -59,6 +61,7 @@ class Format:
     keeps: str
     writer: str
     reader: str
+    units: str = ""
     order: str = ""
     quantiser: str = ""
     position_loss: str = ""
@@ -145,8 +148,8 @@ TABLE = (
     _GLB,
     replace(_GLB, ending="gltf", sidecar=".bin"),
     _USD,
-    replace(_USD, ending="usdc"),
-    replace(_USD, ending="usdz"),
+    replace(_USD, ending="usdc", units="stages.formats.usd_read:units"),
+    replace(_USD, ending="usdz", units="stages.formats.usd_read:units"),
     replace(
         _GLB,
         ending="quantised.glb",
@@ -186,6 +189,7 @@ TABLE = (
         keeps="16-bit positions, 256 sizes and colours, a palette of view-dependent colours",
         writer="stages.formats.sog:write",
         reader="stages.formats.sog_read:read",
+        units="stages.formats.sog_read:units",
         order="stages.scene.morton:morton_order",
         quantiser="stages.formats.quantisation:quantise_for_sog",
         position_loss="stages.formats.sog:position_loss",
