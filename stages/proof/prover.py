@@ -28,7 +28,7 @@ from stages.formats.values import check_finite, drop_undrawable, nonfinite_allow
 from stages.measure.image_metrics import IDENTICAL_DB, capped_psnr_db
 from stages.proof import checks, diagnosis
 from stages.proof.compare import differences
-from stages.proof.content import FileContent
+from stages.proof.content import FileContent, NotCrossCheckedError
 from stages.proof.matching import Rows
 from stages.raster.backends import AUTO
 from stages.raster.draw import raster_settings_of, renderer
@@ -57,6 +57,8 @@ class Proof:
         fault: why the file is wrong; "" if it is not.
         loss_db: the PSNR of a lossy file where it calls for a warning, else None.
         median_position_error: in world units.
+        unchecked: what the independent reader does not understand, where the file is its own
+            original; "" if it was compared.
     """
 
     splats: int
@@ -64,6 +66,7 @@ class Proof:
     fault: str = ""
     loss_db: float | None = None
     median_position_error: float = 0.0
+    unchecked: str = ""
 
 
 def cameras_for(splats: Splats, views: Sequence[View] = ()) -> tuple[Camera, ...]:
@@ -150,6 +153,10 @@ class Prover:
         try:
             content = _drawable(checks.read_back(path))
             errors = checks.CHECKS[row.ending].validate(path)
+        except NotCrossCheckedError as error:
+            if exact:
+                return Proof(len(self.splats), {}, unchecked=str(error))
+            return Proof(0, {}, f"another reader does not understand {error}")
         except Exception as error:  # whatever the reader raises: the file is wrong
             return Proof(0, {}, f"another reader refused it ({reason_of(error)})")
         count = len(content.splats)
