@@ -33,7 +33,7 @@ _WRONG = {"position": 0.01, "log_scale": 0.5, "opacity": 0.1, "rotation": 10.0, 
 # Squared error of SH coefficients above degree 0, relative to their squares: 1 where they are
 # missing, about 2 where they are unrelated.
 _WRONG_SH = 1.1
-# Natural logarithm of the thinnest axis that can be told from a flat splat, relative to the longest
+# Natural logarithm of the thinnest axis that looks unlike a flat splat, relative to the longest
 # one: it is a pixel wide where the splat covers about 150 pixels. Formats differ in how thin an
 # axis they hold, and flat splats have no thickness at all.
 _THINNEST = -5.0
