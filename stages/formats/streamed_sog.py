@@ -128,16 +128,22 @@ def _chunk_folders(path: Path) -> set[Path]:
 
 def _refuse_taken(path: Path, partial: Path, earlier: set[Path]) -> None:
     """Raise SplatError "lod-folder-taken" if a chunk in `partial` has the name of something beside
-    `path` that is not of the `earlier` asset."""
+    `path` that is not of the `earlier` asset, and no chunk that an interrupted write left."""
     for chunk in sorted(partial.iterdir()):
         place = path.with_name(chunk.name)
-        if os.path.lexists(place) and place not in earlier:
+        if os.path.lexists(place) and place not in earlier and not _holds_only_sog(place):
             raise UsageError(
                 "lod-folder-taken",
                 given=f"{place} exists and is not a part of an asset at {path}.",
                 wanted="A folder in which the chunks of the asset overwrite nothing.",
                 hint="Name another, empty folder.",
             )
+
+
+def _holds_only_sog(folder: Path) -> bool:
+    if folder.is_symlink() or not folder.is_dir():
+        return False
+    return all(file.name == "meta.json" or file.suffix == ".webp" for file in folder.iterdir())
 
 
 def _remove_chunk(folder: Path) -> None:

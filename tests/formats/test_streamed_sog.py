@@ -143,7 +143,7 @@ def test_a_folder_of_the_user_s_is_refused_before_anything_changes(
 ) -> None:
     path = tmp_path / "lod-meta.json"
     (tmp_path / "0_0").mkdir()
-    (tmp_path / "0_0" / "meta.json").write_text("mine")
+    (tmp_path / "0_0" / "photo.jpg").write_text("mine")
     if earlier is not None:
         path.write_text(earlier)
     before = {file: file.read_bytes() for file in tmp_path.rglob("*.*")}
@@ -151,6 +151,12 @@ def test_a_folder_of_the_user_s_is_refused_before_anything_changes(
         levels.write(path, many_splats(100))
     assert (refused.value.code, refused.value.family) == ("lod-folder-taken", Family.USAGE)
     assert {file: file.read_bytes() for file in tmp_path.rglob("*.*")} == before
+
+
+def test_chunks_that_an_interrupted_write_left_are_replaced(asset: Path) -> None:
+    asset.unlink()
+    levels.write(asset, many_splats(100))
+    assert len(formats.read(asset)) == 100
 
 
 def test_no_splats_at_all_are_an_asset_too(tmp_path: Path) -> None:
