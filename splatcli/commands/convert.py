@@ -12,6 +12,7 @@ import typer
 
 from splatcli import console
 from splatcli.arguments import ENDINGS
+from stages.base.errors import UsageError
 from stages.run import results
 
 if TYPE_CHECKING:
@@ -36,11 +37,14 @@ def convert(
 
     rows = formats.format_of(source), formats.format_of(target)  # before any work is done
     begun = time.monotonic()
-    make_folder(target.parent)
-    with _progress() as begin, scratch.scratch_in(target.parent, spare=True):
+    # the folder of the target is made once there is something to write
+    nearest = next(folder for folder in target.absolute().parents if folder.is_dir())
+    with _progress() as begin, scratch.scratch_in(nearest, spare=True):
         begin(f"reading {source}")
         splats = formats.read(source)
+        _refuse_nothing(source, target, splats)
         begin(f"writing {target}")
+        make_folder(target.parent)
         dropped = formats.write(target, splats, units=formats.units_of(source))
         warnings = [*losses_of(rows[1], target.name, splats).values()]
         begin(f"comparing {target}")
@@ -69,6 +73,20 @@ def convert(
     for warning in warnings:
         console.warn(f"Warning: {warning}")
     _show(facts, found)
+
+
+def _refuse_nothing(source: Path, target: Path, splats: Splats) -> None:
+    """Raise SplatError "convert-nothing" where the new file would have no bytes at all."""
+    from stages.formats import format_of
+    from stages.formats.values import drop_undrawable
+
+    if format_of(target).ending == "splat" and not len(drop_undrawable(splats)[0]):
+        raise UsageError(
+            "convert-nothing",
+            given=f"{source} holds no splats that can be drawn.",
+            wanted="At least one: a .splat without splats has no bytes, and nothing reads it.",
+            hint="Write another format: all others have a header.",
+        )
 
 
 def _show(facts: dict[str, Any], found: dict[str, Any]) -> None:

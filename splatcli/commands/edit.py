@@ -14,11 +14,14 @@ from splatcli.arguments import ENDINGS
 from splatcli.folders import load_target
 from splatcli.operation_options import parsed_operations
 from stages.base.errors import UsageError
+from stages.base.text import counted
 from stages.run import results
 
 if TYPE_CHECKING:
     from stages.editing.scene import EditedScene
     from stages.editing.syntax import ParsedOperation
+
+_LEFT_OUT = "Left out, because of values that no viewer can draw: {}."
 
 
 def edit(
@@ -63,6 +66,7 @@ def _edit(
     from stages.base import scratch
     from stages.base.atomic import make_folder
     from stages.editing import levels, operations
+    from stages.formats.losses import losses_of
 
     row, prepared = formats.format_of(target), operations.prepare_operations(parsed, target)
     if not dry_run:
@@ -82,8 +86,13 @@ def _edit(
             facts |= {"psnr_before_db": round(start_db, 3), "psnr_db": _db(scene)}
         if not dry_run:
             views = scene.placed_views()
-            levels.write(target, scene.splats, units=scene.units, views=views)
+            dropped = levels.write(target, scene.splats, units=scene.units, views=views)
+            facts |= {"splats": len(scene.splats) - dropped, "dropped": dropped}
             facts |= {"target": str(target), "size_bytes": row.size_bytes(target)}
+            facts["warnings"] = [
+                *([_LEFT_OUT.format(counted(dropped, "splat"))] if dropped else []),
+                *losses_of(row, target.name, scene.splats).values(),
+            ]
             if views:
                 facts |= _proven(source, target, scene)
     return facts
@@ -100,7 +109,9 @@ def _load_scene(source: Path, antialias: bool) -> EditedScene:
 
     splats, pipeline = load_target(source, antialias=antialias)
     pipeline = pipeline or results.run_around(source)
-    splats = drop_undrawable(splats)[0]
+    splats, dropped = drop_undrawable(splats)
+    if dropped and not console.mode.as_json:
+        console.warn(f"Warning: {_LEFT_OUT.format(counted(dropped, 'splat'))}")
     if pipeline is None or pipeline.manifest("sfm") is None:
         return EditedScene(splats, units_of(source))
     found = pipeline.load("sfm")
@@ -148,6 +159,8 @@ def _report(parsed: ParsedOperation, before: int, scene: EditedScene) -> dict[st
 
 
 def _show(facts: dict[str, Any]) -> None:
+    for warning in facts.get("warnings", ()):
+        console.warn(f"Warning: {warning}")
     result = f"{facts['splats']:,} splats, {facts['splats_before']:,} before"
     if "psnr_db" in facts:
         change = facts["psnr_db"] - facts["psnr_before_db"]

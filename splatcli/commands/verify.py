@@ -26,6 +26,8 @@ _ONLY_ITSELF = (
     "That it is what was trained is not shown by this; name the original with --against."
 )
 
+_UNCHECKED = "could not be cross-checked"
+
 
 @dataclass(frozen=True)
 class _Original:
@@ -167,8 +169,9 @@ def _facts(file: Path, proof: Proof, original: _Original) -> dict[str, Any]:
         "size_bytes": size,
         "bytes_per_splat": round(size / max(1, proof.splats), 2),
         **proof.figures,
-        "right": not proof.fault,
+        "right": None if proof.unchecked else not proof.fault,
         "fault": proof.fault,
+        "unchecked": proof.unchecked,
     }
 
 
@@ -176,25 +179,39 @@ def _print(found: list[tuple[Path, Proof]], original: _Original) -> None:
     facts = [_facts(file, proof, original) for file, proof in found]
     if console.mode.quiet:
         for each in facts:
-            what = each["fault"] or console.fidelity(each["verify_db"])
+            what = each["fault"] or (
+                _UNCHECKED if each["unchecked"] else console.fidelity(each["verify_db"])
+            )
             console.out.print(f"{each['file']}: {what}", markup=False)
         return
-    hidden = {"file", "size_bytes", "against", "right", "fault", "worst_attribute", "worst_splat"}
+    hidden = {"file", "size_bytes", "against", "right", "fault", "unchecked"}
+    hidden |= {"worst_attribute", "worst_splat"}
     shown = [name for name in dict.fromkeys(chain(*facts)) if name not in hidden]
     rows = [
         (_label(name), *(_figure(name, each.get(name, "-")) for each in facts)) for name in shown
     ]
     rows.append(("worst", *map(_worst, facts)))
-    rows.append(("verdict", *("wrong" if each["fault"] else "right" for each in facts)))
+    rows.append(("verdict", *map(_verdict, facts)))
     console.table(
         ("", *(file.name for file, _ in found)), rows, title=f"Compared with {original.name}"
     )
-    if original.itself:
+    if original.itself and not found[0][1].unchecked:
         console.note(_ONLY_ITSELF, "dim")
     for file, proof in found:
+        if proof.unchecked:
+            console.warn(
+                f"Warning: {file.name} {_UNCHECKED}: the second reader does not understand "
+                f"{proof.unchecked}. The first one found the file whole."
+            )
         if proof.loss_db is not None:
             loss = f"{file.name} shows: it differs by {proof.loss_db:.1f} dB. {_why(file)}"
             console.warn(f"Warning: {loss}")
+
+
+def _verdict(facts: dict[str, Any]) -> str:
+    if facts["unchecked"]:
+        return "not cross-checked"
+    return "wrong" if facts["fault"] else "right"
 
 
 def _worst(facts: dict[str, Any]) -> str:

@@ -85,6 +85,7 @@ def reading(path: Path, kind: FileKind = SPLATS) -> Iterator[None]:
         ValueError,
         LookupError,
         TypeError,
+        AttributeError,  # of a JSON list where an object is wanted
         OverflowError,
         RecursionError,
         EOFError,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -171,7 +172,9 @@ def _limiting_size(max_bytes: float, target: Path) -> Operation:
     row = formats.format_of(target)
 
     def size_bytes(scene: EditedScene) -> int:
-        with tempfile.TemporaryDirectory(dir=target.parent, prefix=partial_prefix()) as folder:
+        # a dry run makes no folder for the target and may read one that it must not change
+        beside = target.parent if os.access(target.parent, os.W_OK) else None
+        with tempfile.TemporaryDirectory(dir=beside, prefix=partial_prefix()) as folder:
             path = Path(folder) / row.file_name("scene")
             levels.write(path, scene.splats, units=scene.units, views=scene.placed_views())
             return row.size_bytes(path)

@@ -103,8 +103,20 @@ def read(path: Path, *, strict: bool = True) -> Splats:
 
 
 def units_of(path: Path) -> str:
-    """ "metres" where the start of the file declares it, as our .ply, glTF and .sog do; else
-    "arbitrary". Raises SplatError "splats-unreadable"."""
-    with reading(Path(path)), Path(path).open("rb") as file:
-        start = file.read(_START_BYTES)
-    return "metres" if _METRES.search(start) else "arbitrary"
+    """ "metres" where the file, or the one beside it that holds its origin, declares them as ours
+    do; else "arbitrary". Raises SplatError as `format_of`, or "splats-unreadable"."""
+    from stages.formats.offset import offset_path, read_units
+
+    path, row = Path(path), format_of(path)
+    if not row.holds_origin:
+        if not offset_path(path).exists():
+            return "arbitrary"
+        with reading(offset_path(path)):
+            declared = read_units(path)
+    elif row.units:
+        with reading(path):
+            declared = resolve_name(row.units)(path)
+    else:
+        with reading(path), path.open("rb") as file:
+            declared = "metres" if _METRES.search(file.read(_START_BYTES)) else ""
+    return "metres" if declared == "metres" else "arbitrary"

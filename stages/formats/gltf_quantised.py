@@ -34,7 +34,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
     Normalised scales end at 1, so the node scales them up by a power of two; positions are divided
     by it, which is exact. Raises SplatError as `gltf.write`.
     """
-    unit = _unit(linear_scales(splats))
+    unit = _unit(linear_scales(splats), float(np.abs(splats.means).max(initial=0.0)))
     primitives = [_attributes(group, unit) for group in _groups(splats)]
     write_file(Path(path), primitives, splats, units, node_scale=unit or 1.0)
 
@@ -51,13 +51,15 @@ def _groups(splats: Splats) -> Iterator[Splats]:
         yield splats.with_sh_degree(int(degree)).take(slice(None) if chosen.all() else chosen)
 
 
-def _unit(scales: NDArray[np.float32]) -> float | None:
-    """The power of two above all `scales` [N, 3]; None if its steps would be too coarse."""
+def _unit(scales: NDArray[np.float32], farthest: float) -> float | None:
+    """The power of two above all `scales` [N, 3]; None if its steps would be too coarse, or if the
+    largest coordinate `farthest`, divided by it, would pass float32."""
     if not len(scales):
         return None
     unit = float(2.0 ** np.ceil(np.log2(scales.max())))
     median = float(np.median(scales.max(axis=1)))
-    return unit if unit / _U16 <= _MAX_STEP * median else None
+    fits = farthest / unit <= float(np.finfo(np.float32).max)
+    return unit if fits and unit / _U16 <= _MAX_STEP * median else None
 
 
 def _attributes(splats: Splats, unit: float | None) -> dict[str, Attribute]:

@@ -145,7 +145,7 @@ def _file_beside(path: Path, uri: str) -> Path:
     parts = urlsplit(uri)
     name = unquote(parts.path)
     folder = path.parent.resolve()
-    inside = not (parts.scheme or parts.netloc or "\\" in name or "\0" in name or ":" in name)
+    inside = not (parts.scheme or parts.netloc or "\\" in name or "\0" in name)
     target = (folder / name).resolve() if inside else folder
     if not inside or not name or not target.is_relative_to(folder):
         raise BadFileError(f"it refers to {uri[:80]!r}, which is not a file in its own folder")

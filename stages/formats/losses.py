@@ -10,6 +10,8 @@ from stages.formats.table import Format
 from stages.formats.values import drop_undrawable
 from stages.scene import Splats
 
+ENLARGE = "`splat edit --scale 1000` enlarges a scene; .ply, .glb and .usdz hold all sizes"
+
 
 def losses_of(row: Format, file_name: str, splats: Splats) -> dict[str, str]:
     """What a file of the format `row` cannot hold of `splats`: texts for the user by the end of
@@ -21,6 +23,8 @@ def losses_of(row: Format, file_name: str, splats: Splats) -> dict[str, str]:
     if row.position_loss and (loss := resolve_name(row.position_loss)(splats)):
         advice = "`splat edit --drop-floaters` removes outliers; .ply, .glb and .usdz hold them."
         found["range"] = f"{file_name} {loss}. {advice}"
+    if row.size_loss and (loss := resolve_name(row.size_loss)(splats)):
+        found["size"] = f"{file_name} {loss}. {ENLARGE}."
     if splats.draw_settings.antialias and not row.drawn_antialiased:
         found["drawing"] = (
             f"{file_name} holds splats for antialiased drawing"

@@ -53,6 +53,12 @@ def read_offset(path: Path, row: Format, splats: Splats) -> Splats:
     return replace(splats, origin=said.origin, place=said.place)
 
 
+def read_units(path: Path) -> str:
+    """The units that the file beside `path` declares; "" if it declares none. Raises what damaged
+    bytes cause."""
+    return str(json.loads(offset_path(path).read_text(encoding="utf-8")).get("units", ""))
+
+
 def is_located(splats: Splats) -> bool:
     """Whether there is something to say of where they lie."""
     return bool(splats.origin.any()) or splats.place is not None

@@ -44,6 +44,13 @@ def read(path: Path) -> Splats:
         return Source(in_zip(package), path.stat().st_size).splats()
 
 
+def units(path: Path) -> str:
+    """The units that the meta.json of a .sog declares; "" if it declares none. Raises as `read`."""
+    with zipfile.ZipFile(path) as package:
+        asset = Source(in_zip(package), path.stat().st_size).meta().get("asset")
+    return str(asset.get("units", "")) if isinstance(asset, dict) else ""
+
+
 def in_zip(package: zipfile.ZipFile) -> Member:
     """A reader of the members of a zip."""
 

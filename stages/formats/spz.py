@@ -36,6 +36,8 @@ _USUAL_FRACTIONAL_BITS, _MOST_FRACTIONAL_BITS = 12, 23
 # between neighbouring splats.
 _STEP_OF_SPACING = 1 / 16
 _FIXED_LIMIT = (1 << 23) - 1
+_LEAST_LOG_SCALE = -10.0
+_FEW = 0.01  # a share of splats whose sizes may change unnoticed: those too small are hardly seen
 _SH_STEPS = (8, 16, 16)  # of 256, for degree 1, 2, 3: 5 and 4 bits, which gzip compresses
 
 
@@ -54,7 +56,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
         lambda block: _positions(block, bits),
         _opacities,
         lambda block: _byte(255 * (COLOUR_SCALE * block.sh[:, 0].astype(np.float64) + 0.5)),
-        lambda block: _byte(16 * (_within_reach(block, bits).log_scales + 10)),
+        lambda block: _byte(16 * (_within_reach(block, bits).log_scales - _LEAST_LOG_SCALE)),
         lambda block: _pack_rotations(flipped(block.with_sh_degree(0)).quaternions),
         _sh,
     )
@@ -83,6 +85,21 @@ def position_loss(splats: Splats) -> str:
     return (
         f"holds positions of 24 bits, and {counted(count, 'splat')} of {len(splats):,} lie farther "
         "out: they were moved towards the origin and scaled down"
+    )
+
+
+def size_loss(splats: Splats) -> str:
+    """What happens to the splats that are smaller than the file can hold; "" if few are."""
+    logs = splats.log_scales
+    count = sum(
+        int(np.count_nonzero(logs[rows].max(axis=1) < _LEAST_LOG_SCALE))
+        for rows in blocks(len(logs))
+    )
+    if count <= _FEW * len(logs):
+        return ""
+    return (
+        f"holds sizes from {math.exp(_LEAST_LOG_SCALE):.2g} units upwards, and "
+        f"{counted(count, 'splat')} of {len(logs):,} are smaller: they were enlarged to that"
     )
 
 

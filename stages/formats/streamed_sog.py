@@ -9,6 +9,8 @@ leaf after the other, and sort the rows of a leaf along a Morton curve.
 from __future__ import annotations
 
 import json
+import os
+import re
 import shutil
 import zipfile
 from collections.abc import Iterator, Sequence
@@ -22,16 +24,17 @@ from numpy.typing import NDArray
 from stages.base.atomic import make_folder, partial_prefix, replacing
 from stages.base.bad_files import BadFileError, reading
 from stages.base.blocks import reported_blocks
+from stages.base.errors import UsageError
 from stages.formats import html, sog
 from stages.formats.json_fields import agreed, located, location_fields, whole
 from stages.formats.sog_read import Source, antialias_of, in_folder, in_zip
-from stages.formats.table import CHUNK_FOLDER
 from stages.formats.values import allocate, fill
 from stages.scene import Splats, View, morton
 from stages.scene.rotations import matrices_of
 
 LEAF, CHUNK_SPLATS = 1 << 15, 1 << 17  # splats of the finest level; of a chunk, about
 _META_LIMIT_BYTES, _DEEPEST, _MOST_LEVELS = 1 << 26, 64, 100
+_CHUNK = re.compile(r"([0-9]+_[0-9]+)/meta\.json")  # as `_write_chunks` names them: level, number
 _Rows = NDArray[np.intp]
 
 
@@ -61,7 +64,8 @@ def write(
     coarser: Sequence[Splats] = (),
 ) -> None:
     """Write a streamed SOG and, beside it, a page that shows it on any web server. Makes the
-    folder, replaces an earlier asset in it, and writes lod-meta.json last.
+    folder, replaces an earlier asset in it, and writes lod-meta.json last. Of the earlier asset
+    only files of SOG in the folders that its lod-meta.json names are removed.
 
     Args:
         path: the asset's lod-meta.json.
@@ -70,7 +74,8 @@ def write(
         views: cameras of the page.
         coarser: coarser levels of detail of the same scene, finest first, all drawable.
 
-    Raises SplatError when the asset cannot be written.
+    Raises SplatError when the asset cannot be written, and "lod-folder-taken" if a folder with the
+    name of a chunk exists that is not the earlier asset's.
     """
     levels = [splats, *coarser]
     make_folder(path.parent)
@@ -93,17 +98,60 @@ def write(
             "filenames": names,
             "tree": _described(tree, levels),
         }
+        earlier = _chunk_folders(path)
+        _refuse_taken(path, partial, earlier)
         with replacing(path) as temporary:
             temporary.write_text(json.dumps(meta, allow_nan=False), encoding="utf-8")
             path.unlink(missing_ok=True)  # it must never refer to other chunks
-            for old in path.parent.iterdir():
-                if CHUNK_FOLDER.match(old.name) and old.is_dir():
-                    shutil.rmtree(old)
+            for old in earlier:
+                _remove_chunk(old)
             for new in sorted(partial.iterdir()):
-                new.rename(path.with_name(new.name))
+                path.with_name(new.name).mkdir(exist_ok=True)
+                for file in new.iterdir():
+                    os.replace(file, path.with_name(new.name) / file.name)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     html.write_beside(path, splats, units, views, splat_widths(path, splats))
+
+
+def _chunk_folders(path: Path) -> set[Path]:
+    """The folders of chunks of the asset at `path`, by its own list. A file that is no list of
+    chunks names none: whatever lies beside it may be the user's."""
+    try:
+        names = json.loads(path.read_text(encoding="utf-8"))["filenames"]
+        found = filter(None, (_CHUNK.fullmatch(name) for name in names))
+        folders = {path.with_name(match[1]) for match in found}
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        return set()
+    return {folder for folder in folders if folder.is_dir() and not folder.is_symlink()}
+
+
+def _refuse_taken(path: Path, partial: Path, earlier: set[Path]) -> None:
+    """Raise SplatError "lod-folder-taken" if a chunk in `partial` has the name of something beside
+    `path` that is not of the `earlier` asset, and no chunk that an interrupted write left."""
+    for chunk in sorted(partial.iterdir()):
+        place = path.with_name(chunk.name)
+        if os.path.lexists(place) and place not in earlier and not _holds_only_sog(place):
+            raise UsageError(
+                "lod-folder-taken",
+                given=f"{place} exists and is not a part of an asset at {path}.",
+                wanted="A folder in which the chunks of the asset overwrite nothing.",
+                hint="Name another, empty folder.",
+            )
+
+
+def _holds_only_sog(folder: Path) -> bool:
+    if folder.is_symlink() or not folder.is_dir():
+        return False
+    return all(file.name == "meta.json" or file.suffix == ".webp" for file in folder.iterdir())
+
+
+def _remove_chunk(folder: Path) -> None:
+    """Remove the files of a SOG, and the folder if nothing else is in it."""
+    for file in [folder / "meta.json", *folder.glob("*.webp")]:
+        file.unlink(missing_ok=True)
+    if not any(folder.iterdir()):
+        folder.rmdir()
 
 
 def _cut(levels: Sequence[Splats]) -> _Tree:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
+from pkgutil import resolve_name
 
 from stages.base.errors import UsageError
 
@@ -27,12 +28,16 @@ class Format:
         writer: (path, splats, *, units), with drawable splats. It also takes `views` if
             `takes_views`, and `coarser` if `streamed`.
         reader: (path) -> Splats, y down; raises BadFileError, or what damaged bytes cause.
+        units: (path) -> the units that a file declares, or ""; raises as `reader`. "" for formats
+            whose files declare them in text at their start, or not at all.
         order: (splats) -> [N] the row of `splats` that each row of the file comes from; "" if the
             format keeps the order.
         quantiser: (splats, bit depths) -> Splats on coarser grids, for a format that compresses
             repeated values; "" for the others.
         position_loss: (splats) -> what far splats do to the positions, as the end of "the file
             ...", or ""; "" for formats in which they do nothing.
+        size_loss: (splats) -> what happens to splats that are too small, as the end of "the file
+            ...", or ""; "" for formats that hold all sizes.
         loses: what of the splats changes, as the end of "the format ..."; "" if every value comes
             back as float32.
         sh_degree: the highest SH degree that is kept.
@@ -40,6 +45,8 @@ class Format:
         holds_origin: whether a file holds the origin of a georeferenced scene; else it is written
             beside, see `stages.formats.offset`.
         sidecar: the suffix of a file beside it that belongs to it; "" if there is none.
+        parts: (path) -> the files that the file at `path` names, by relative name; "" if it names
+            none.
         takes_views: whether the file also holds cameras.
         needs_finetuning: whether rounding is so coarse that splats are fine-tuned to it.
         drawn_antialiased: whether programs that the format is for draw it with opacity
@@ -54,14 +61,17 @@ class Format:
     keeps: str
     writer: str
     reader: str
+    units: str = ""
     order: str = ""
     quantiser: str = ""
     position_loss: str = ""
+    size_loss: str = ""
     loses: str = ""
     sh_degree: int = 3
     y_up: bool = False
     holds_origin: bool = True
     sidecar: str = ""
+    parts: str = ""
     takes_views: bool = False
     needs_finetuning: bool = False
     drawn_antialiased: bool = False
@@ -82,12 +92,13 @@ class Format:
         return self.ending if self.streamed else f"{stem}.{self.ending}"
 
     def files(self, path: Path) -> list[Path]:
-        """`path` and the files beside it that belong to it."""
+        """`path` and the files beside it that belong to it. Raises SplatError "splats-unreadable"
+        if the asset has parts and does not name them."""
         page = path.with_suffix(self.sidecar) if self.sidecar else path
         beside = [path, page] if page != path and page.is_file() else [path]
-        if self.streamed:
-            candidates = sorted(path.parent.glob("*_*/*"))
-            return [*beside, *(file for file in candidates if CHUNK_FOLDER.match(file.parent.name))]
+        if self.parts:
+            chunks = set(resolve_name(self.parts)(path).values()) - set(beside)
+            return [*beside, *sorted(chunks)]
         return beside
 
     def size_bytes(self, path: Path) -> int:
@@ -95,7 +106,6 @@ class Format:
         return sum(file.stat().st_size for file in self.files(path))
 
 
-CHUNK_FOLDER = re.compile(r"[0-9]+_[0-9]+$")  # folders of a streamed asset: level, number
 _MESH = re.compile(r"\.mesh\.(glb|ply)$")  # of the names of meshes
 
 _GLB = Format(
@@ -138,8 +148,8 @@ TABLE = (
     _GLB,
     replace(_GLB, ending="gltf", sidecar=".bin"),
     _USD,
-    replace(_USD, ending="usdc"),
-    replace(_USD, ending="usdz"),
+    replace(_USD, ending="usdc", units="stages.formats.usd_read:units"),
+    replace(_USD, ending="usdz", units="stages.formats.usd_read:units"),
     replace(
         _GLB,
         ending="quantised.glb",
@@ -166,6 +176,7 @@ TABLE = (
         writer="stages.formats.spz:write",
         reader="stages.formats.spz_read:read",
         position_loss="stages.formats.spz:position_loss",
+        size_loss="stages.formats.spz:size_loss",
         holds_origin=False,
         loses="has sizes in steps of 6 %, 8-bit colours and view-dependent colour of 4 and 5 bits",
         needs_finetuning=True,
@@ -178,6 +189,7 @@ TABLE = (
         keeps="16-bit positions, 256 sizes and colours, a palette of view-dependent colours",
         writer="stages.formats.sog:write",
         reader="stages.formats.sog_read:read",
+        units="stages.formats.sog_read:units",
         order="stages.scene.morton:morton_order",
         quantiser="stages.formats.quantisation:quantise_for_sog",
         position_loss="stages.formats.sog:position_loss",
@@ -193,6 +205,7 @@ TABLE = (
         order="stages.formats.streamed_sog:order",
         loses="has 256 sizes and colours, and a palette of view-dependent colours",
         sidecar=".html",
+        parts="stages.formats.streamed_sog:parts_of",
         takes_views=True,
         streamed=True,
     ),

@@ -1,8 +1,8 @@
 """Reading Gaussian splats from USD, in a child process.
 
 The USD library aborts the process for some kinds of damage in a .usdc, so a child opens the file:
-`python -m stages.formats.usd_read FILE OUTPUT [allow-nonfinite]` writes the splats to OUTPUT (see
-stages.scene.storage) or prints the reason why it cannot.
+`python -m stages.formats.usd_read FILE OUTPUT [allow-nonfinite | units]` writes the splats (see
+stages.scene.storage) or the declared units to OUTPUT, or prints the reason why it cannot.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ from stages.scene.recentring import recentred
 
 _TYPE = "ParticleField3DGaussianSplat"
 _ARCS = ("references", "payload", "inheritPaths", "specializes", "clips")
+_UNITS = "units"
 _REFUSED = 3  # exit status of the child when it printed a reason
 _TIMEOUT_SECONDS = 600
 # Memory of the child: beyond the library's, and per byte of the file (arrays may be compressed).
@@ -53,23 +54,35 @@ def read(path: Path) -> Splats:
     """
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "splats.bin"
-        flags = ["allow-nonfinite"] if allows_nonfinite() else []
-        command = python_module("stages.formats.usd_read", str(path.resolve()), str(output), *flags)
-        # The library writes crash reports to TMPDIR; they are deleted with the folder.
-        environment = {"TMPDIR": folder, "PXR_WORK_THREAD_LIMIT": _THREADS}
-        child = start_child(command, subprocess.PIPE, environment)
-        try:
-            said, _ = child.communicate(timeout=_TIMEOUT_SECONDS)
-        except subprocess.TimeoutExpired as error:
-            raise BadFileError(f"it was not read within {_TIMEOUT_SECONDS} s") from error
-        finally:
-            end_child(child)
-        if child.returncode == _REFUSED:
-            raise BadFileError(said.decode("utf-8", "replace").strip()[:300])
-        if child.returncode != 0:
-            how = how_it_ended(child.returncode)
-            raise BadFileError(f"it is damaged: the USD library ended with {how} on it")
+        _in_child(path, output, *(["allow-nonfinite"] if allows_nonfinite() else []))
         return load_splats(output)
+
+
+def units(path: Path) -> str:
+    """The units that a USD file declares; "" if it declares none. Raises BadFileError as `read`."""
+    with tempfile.TemporaryDirectory() as folder:
+        output = Path(folder) / "units.txt"
+        _in_child(path, output, _UNITS)
+        return output.read_text(encoding="utf-8")
+
+
+def _in_child(path: Path, output: Path, *flags: str) -> None:
+    """`main` in a child process. output: in a folder that is deleted afterwards."""
+    command = python_module("stages.formats.usd_read", str(path.resolve()), str(output), *flags)
+    # The library writes crash reports to TMPDIR.
+    environment = {"TMPDIR": str(output.parent), "PXR_WORK_THREAD_LIMIT": _THREADS}
+    child = start_child(command, subprocess.PIPE, environment)
+    try:
+        said, _ = child.communicate(timeout=_TIMEOUT_SECONDS)
+    except subprocess.TimeoutExpired as error:
+        raise BadFileError(f"it was not read within {_TIMEOUT_SECONDS} s") from error
+    finally:
+        end_child(child)
+    if child.returncode == _REFUSED:
+        raise BadFileError(said.decode("utf-8", "replace").strip()[:300])
+    if child.returncode != 0:
+        how = how_it_ended(child.returncode)
+        raise BadFileError(f"it is damaged: the USD library ended with {how} on it")
 
 
 def parse(path: Path) -> Splats:
@@ -84,14 +97,19 @@ def _parsed(stage: Any) -> Splats:
         raise BadFileError(f"it holds no {_TYPE}")
     splats = concatenate(parts)
     del parts
-    note = stage.GetRootLayer().customLayerData.get("splat")
-    note = note if isinstance(note, dict) else {}
+    note = _note(stage)
     origin = np.array(note.get("origin", np.zeros(3)), np.float64).reshape(3)
     place = place_of(note.get("place"), origin)
     means, origin = recentred(splats.means.astype(np.float64), origin)
     splats = replace(splats, means=means, origin=origin, place=place)
     splats = splats.with_antialias(bool(note.get("antialiased", False)))
     return check_finite(flipped(splats, reuse=True))
+
+
+def _note(stage: Any) -> dict[str, Any]:
+    """What our writer notes of the scene; {} in files of other programs."""
+    note = stage.GetRootLayer().customLayerData.get("splat")
+    return note if isinstance(note, dict) else {}
 
 
 def _open(name: str) -> Any:
@@ -185,10 +203,16 @@ def _limit_memory(path: Path) -> None:
 
 
 def main(arguments: list[str]) -> int:
-    """The child. Exit status 0: the splats are in the second file; 3: the reason is printed."""
+    """The child. Exit status 0: the splats, or the units, are in the second file; 3: the reason is
+    printed."""
     source, output = map(Path, arguments[:2])
     _limit_memory(source)
     try:
+        if arguments[2:] == [_UNITS]:
+            with accepted_path(source) as name:
+                found = str(_note(_open(name)).get("units", ""))
+            output.write_text(found, encoding="utf-8")
+            return 0
         with nonfinite_allowed() if arguments[2:] else nullcontext():
             splats = parse(source)
     except BadFileError as error:

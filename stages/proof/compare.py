@@ -33,6 +33,10 @@ _WRONG = {"position": 0.01, "log_scale": 0.5, "opacity": 0.1, "rotation": 10.0, 
 # Squared error of SH coefficients above degree 0, relative to their squares: 1 where they are
 # missing, about 2 where they are unrelated.
 _WRONG_SH = 1.1
+# Natural logarithm of the thinnest axis that looks unlike a flat splat, relative to the longest
+# one: it is a pixel wide where the splat covers about 150 pixels. Formats differ in how thin an
+# axis they hold, and flat splats have no thickness at all.
+_THINNEST = -5.0
 _ANISOTROPIC = 0.2  # a splat has an orientation if its log scales differ by this
 
 
@@ -41,8 +45,9 @@ class Differences:
     """Differences between a file and its original.
 
     Attributes:
-        largest: by attribute; positions in world units, scales as natural logarithms, opacities in
-            0..1, rotations in degrees, SH as stored.
+        largest: by attribute; positions in world units, scales as natural logarithms (axes too thin
+            to be seen count as just visible), opacities in 0..1, rotations in degrees, SH as
+            stored.
         worst: the attribute with the most visible largest difference; "" if all are rounding.
         worst_row: its row in the file.
         wrong: attributes that are wrong for most splats.
@@ -96,11 +101,13 @@ def _orders(truth: Splats, file: Splats, formats: list[Format]) -> Iterator[Rows
 
 
 def _errors(a: Splats, b: Splats) -> dict[str, NDArray[np.floating]]:
-    """By attribute, [N] the difference of each splat."""
+    """By attribute, [N] the difference of each splat of the file, b, from the original, a."""
+    thinnest = a.log_scales.astype(np.float64).max(axis=1, keepdims=True) + _THINNEST
+    sizes = [np.maximum(s.log_scales, thinnest) for s in (a, b)]
     colours = [np.clip(0.5 + SH_C0 * s.sh[:, 0].astype(np.float64), 0, 1) for s in (a, b)]
     return {
         "position": _largest_difference(a.means, b.means),
-        "log_scale": _largest_difference(a.log_scales, b.log_scales),
+        "log_scale": _largest_difference(*sizes),
         "opacity": _largest_difference(a.opacities[:, None], b.opacities[:, None]),
         "rotation": rotation_angles(a.quaternions, b.quaternions),
         "sh": _largest_difference(*(s.sh.reshape(len(s), 3 * s.sh.shape[1]) for s in (a, b))),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +15,11 @@ from stages.scene import Splats
 
 # From the axes of a file to ours. Not taken from the writers: their error must not check itself.
 Y_DOWN, Y_UP = np.eye(4), np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+class NotCrossCheckedError(Exception):
+    """The file uses what an independent reader does not understand; the message names it. That says
+    nothing about whether the file is right."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +40,12 @@ def logits(p: NDArray[np.floating]) -> NDArray[np.float64]:
     inside = np.clip(p, 1e-30, 1 - 1e-9, dtype=np.float64)
     found: NDArray[np.float64] = np.log(inside / (1 - inside))
     return found
+
+
+def says_antialiased(comments: Iterable[str]) -> bool:
+    """Whether a comment of a .ply asks for opacity compensation: Brush's or Postshot's."""
+    asking = (["splatrendermode:", "mip"], ["antialiased", "1"])
+    return any(comment.lower().split() in asking for comment in comments)
 
 
 def splats_of(**arrays: NDArray[np.floating]) -> Splats:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.formats.values import concatenate
-from stages.proof.content import logits, splats_by_rows
+from stages.proof.content import NotCrossCheckedError, logits, says_antialiased, splats_by_rows
 from stages.scene import Splats
 
 
@@ -39,6 +39,9 @@ def compressed_ply(path: Path) -> Splats:
             parts = []
             for suffix, shift, bits in columns:
                 fraction = (words[name].astype(np.int64) >> shift) % 2**bits / (2**bits - 1)
+                if "min_" + suffix not in ranges.data.dtype.names:  # of colours, in old files
+                    parts.append(fraction)
+                    continue
                 low, high = (ranges[e + suffix].astype(float)[chunk] for e in ("min_", "max_"))
                 parts.append(low * (1 - fraction) + high * fraction)
             return np.stack(parts, axis=1)
@@ -61,11 +64,14 @@ def compressed_ply(path: Path) -> Splats:
         }
 
     found = splats_by_rows(data["vertex"].count, values_of)
-    return found.with_antialias("SplatRenderMode: mip" in data.comments)
+    return found.with_antialias(says_antialiased(data.comments))
 
 
 def spz(path: Path) -> Splats:
-    content = gzip.decompress(path.read_bytes())
+    packed = path.read_bytes()
+    if packed.startswith(b"NGSP"):  # without gzip
+        raise NotCrossCheckedError(f"SPZ version {packed[4]}")
+    content = gzip.decompress(packed)
     magic, version, n, degree, fraction, flags = struct.unpack_from("<IIIBBB", content)
     assert magic == 0x5053474E, "the header does not begin with NGSP"
     assert version in (2, 3), f"the version is {version}, not 2 or 3"
@@ -114,6 +120,8 @@ def _smallest_three(parts: NDArray[np.uint8]) -> NDArray[np.float64]:
 def streamed_sog(path: Path) -> Splats:
     """The finest level, leaves in the order of their chunks and rows."""
     meta = json.loads(path.read_text("utf-8"))
+    if meta.get("environment") or not all(n.endswith("/meta.json") for n in meta["filenames"]):
+        raise NotCrossCheckedError("an environment, or chunks that are not folders")
     waiting, found = [meta["tree"]], {}
     while waiting:
         node = waiting.pop()
@@ -172,7 +180,8 @@ def sog(path: Path | BinaryIO) -> Splats:
             "sh": sh,
         }
 
-    return splats_by_rows(meta["count"], values_of).with_antialias(meta["antialias"])
+    antialias = meta.get("antialias", meta.get("model") == "antialiased")
+    return splats_by_rows(meta["count"], values_of).with_antialias(antialias)
 
 
 def _with_largest(column: NDArray[np.integer], others: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -14,6 +14,7 @@ import base64
 import math
 import tempfile
 import zlib
+from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -24,10 +25,18 @@ from numpy.typing import NDArray
 from stages.base.blocks import release_mapped_pages
 from stages.base.usd_path import accepted_path
 from stages.formats.values import concatenate
-from stages.proof.content import logits, splats_by_rows, splats_of
+from stages.proof.content import (
+    NotCrossCheckedError,
+    logits,
+    says_antialiased,
+    splats_by_rows,
+    splats_of,
+)
+from stages.proof.independent_packed import compressed_ply
 from stages.scene import Splats
 
 _PLY_ROWS = 1 << 14  # columns are gathered from the cache
+_FAR_UNITS = 1000  # positions farther out need more than the float32 of `Splats`
 _PAGE_PIECE = 1 << 22  # characters: the parser scans an unfinished element once a piece
 
 
@@ -35,7 +44,12 @@ def ply(path: Path) -> Splats:
     from plyfile import PlyData
 
     content = PlyData.read(str(path), mmap="c")
+    if "chunk" in content:
+        return compressed_ply(path)
     vertex = content["vertex"]
+    wide = content.text or any(vertex.data.dtype[axis].itemsize > 4 for axis in "xyz")
+    if wide and any(np.abs(np.median(vertex[axis])) > _FAR_UNITS for axis in "xyz"):
+        raise NotCrossCheckedError("positions far from zero, more precise than float32")
     per_channel = sum(item.name.startswith("f_rest_") for item in vertex.properties) // 3
 
     def values_of(part: slice) -> dict[str, NDArray[np.floating]]:
@@ -56,7 +70,8 @@ def ply(path: Path) -> Splats:
         return found
 
     splats = splats_by_rows(len(vertex.data), values_of, _PLY_ROWS)
-    return splats.with_antialias("SplatRenderMode: mip" in content.comments)
+    comments = [*content.comments, *(line for part in content for line in part.comments)]
+    return splats.with_antialias(says_antialiased(comments))
 
 
 class _Chunks(HTMLParser):
@@ -115,36 +130,61 @@ def splat(path: Path) -> Splats:
     return splats_by_rows(size // 32, values_of)
 
 
-_Place = tuple[Path, int]  # a file, and the byte at which something begins in it
+_Buffer = Callable[[int, int], bytes]  # (first byte, length) -> as many bytes as there are
 
 
-def _gltf_parts(path: Path) -> tuple[Any, _Place]:
-    """(the document, the place of its first buffer)."""
+def _in_file(path: Path, begins: int = 0) -> _Buffer:
+    return lambda start, length: np.fromfile(
+        path, np.uint8, length, offset=begins + start
+    ).tobytes()
+
+
+def _gltf_buffer(folder: Path, uri: str) -> _Buffer:
     from urllib.parse import unquote
 
+    if not uri.startswith("data:"):
+        return _in_file(folder / unquote(uri))
+    content = base64.b64decode(uri.partition(",")[2], validate=True)
+    return lambda start, length: content[start : start + length]
+
+
+def _gltf_parts(path: Path) -> tuple[Any, list[_Buffer]]:
+    """(the document, its buffers)."""
     from pygltflib import GLTF2
 
     if path.suffix.lower() == ".gltf":
         document = GLTF2.gltf_from_json(path.read_text(encoding="utf-8"))
-        name = unquote(document.buffers[0].uri) if document.buffers else path.name
-        return document, (path.parent / name, 0)
+        return document, [_gltf_buffer(path.parent, buffer.uri) for buffer in document.buffers]
     with path.open("rb") as file:
         head = np.frombuffer(file.read(20), "<u4")
         assert file.seek(0, 2) == head[2], "its length is not that of its header"
         file.seek(20)
         document = GLTF2.gltf_from_json(file.read(int(head[3])).decode("utf-8"))
-    return document, (path, 20 + int(head[3]) + 8)
+    more = [_gltf_buffer(path.parent, buffer.uri) for buffer in document.buffers[1:]]
+    return document, [_in_file(path, 20 + int(head[3]) + 8), *more]
+
+
+def _node_scale(document: Any) -> float:
+    """The scale of the only node. Raises NotCrossCheckedError for another placement."""
+    scales = [node.scale or [1.0, 1.0, 1.0] for node in document.nodes]
+    moved = any(
+        any(node.translation or ()) or any((node.rotation or ())[:3]) or node.matrix
+        for node in document.nodes
+    )
+    single = len(scales) == 1 and len(set(scales[0])) == 1
+    if moved or len(document.meshes) > 1 or not (single or all(s == [1] * 3 for s in scales)):
+        raise NotCrossCheckedError("nodes that place splats")
+    return float(scales[0][0]) if scales else 1.0
 
 
 def gltf(path: Path) -> Splats:
-    document, buffer = _gltf_parts(path)
-    scale = 1.0
-    if document.nodes:
-        scale = (document.nodes[0].scale or [1.0])[0]
+    document, buffers = _gltf_parts(path)
+    scale = _node_scale(document)
 
     def values(primitive: Any, name: str) -> NDArray[np.floating]:
         accessor = document.accessors[getattr(primitive.attributes, name)]
-        return _accessor_values(accessor, document.bufferViews[accessor.bufferView], buffer)
+        view = document.bufferViews[accessor.bufferView]
+        return _accessor_values(accessor, view, buffers[view.buffer])
 
     prefix = "KHR_gaussian_splatting:"
     parts = []
@@ -173,18 +213,18 @@ def gltf(path: Path) -> Splats:
     return concatenate(parts).with_antialias(antialias)
 
 
-def _accessor_values(accessor: Any, view: Any, buffer: _Place) -> NDArray[np.floating]:
+def _accessor_values(accessor: Any, view: Any, buffer: _Buffer) -> NDArray[np.floating]:
     """[count, components], one element after the other; c / (2^b - 1) or, signed,
     c / (2^(b - 1) - 1) of normalised integers (glTF 2.0, section 3.6.2.2)."""
     kind = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}[accessor.componentType]
     largest = {5120: 127, 5121: 255, 5122: 32767, 5123: 65535, 5126: 1}[accessor.componentType]
     element = np.dtype((kind, ({"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor.type],)))
     step = view.byteStride or element.itemsize
-    start = buffer[1] + (view.byteOffset or 0) + (accessor.byteOffset or 0)
+    start = (view.byteOffset or 0) + (accessor.byteOffset or 0)
     # a record whose padding is the space between two elements; the last element may lack it
     record = np.dtype({"names": ["v"], "formats": [element], "offsets": [0], "itemsize": step})
     length = accessor.count * step
-    data = np.fromfile(buffer[0], np.uint8, length, offset=start).tobytes().ljust(length, b"\0")
+    data = buffer(start, length).ljust(length, b"\0")
     values = np.frombuffer(data, record, accessor.count)["v"]
     if not accessor.normalized:
         return values
@@ -197,7 +237,7 @@ def usd(path: Path) -> Splats:
 
 
 def _usd(name: str) -> Splats:
-    from pxr import Gf, Sdf, Usd, Vt
+    from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
     # The column in which each of w, x, y, z arrives, measured instead of assumed.
     columns = np.argsort(np.array(Vt.QuatfArray([Gf.Quatf(1, 2, 3, 4)]))[0])
@@ -207,7 +247,11 @@ def _usd(name: str) -> Splats:
     for prim in stage.Traverse():
         if prim.GetTypeName() != "ParticleField3DGaussianSplat":
             continue
+        if UsdGeom.XformCache().GetLocalToWorldTransform(prim) != Gf.Matrix4d(1):
+            raise NotCrossCheckedError("prims that place splats")
         get = prim.GetAttribute
+        if get("positions").Get() is None:
+            raise NotCrossCheckedError("values of half precision")
         degree = get("radiance:sphericalHarmonicsDegree").Get()
         # Copied, because Numba would compile all kernels again for read-only arrays.
         coefficients = np.array(get("radiance:sphericalHarmonicsCoefficients").Get(), np.float32)
@@ -220,7 +264,8 @@ def _usd(name: str) -> Splats:
                 sh=coefficients.reshape(-1, (degree + 1) ** 2, 3),
             )
         )
-    antialias = stage.GetRootLayer().customLayerData["splat"].get("antialiased", False)
+    note = stage.GetRootLayer().customLayerData.get("splat")
+    antialias = isinstance(note, dict) and note.get("antialiased", False)
     return concatenate(parts).with_antialias(antialias)
 
 

@@ -23,11 +23,12 @@ from stages.base.errors import QualityError
 from stages.base.text import counted, reason_of
 from stages.formats import BY_ENDING, Format, format_of
 from stages.formats.compressed_ply import outlier_shells
+from stages.formats.losses import ENLARGE
 from stages.formats.values import check_finite, drop_undrawable, nonfinite_allowed
 from stages.measure.image_metrics import IDENTICAL_DB, capped_psnr_db
 from stages.proof import checks, diagnosis
 from stages.proof.compare import differences
-from stages.proof.content import FileContent
+from stages.proof.content import FileContent, NotCrossCheckedError
 from stages.proof.matching import Rows
 from stages.raster.backends import AUTO
 from stages.raster.draw import raster_settings_of, renderer
@@ -56,6 +57,8 @@ class Proof:
         fault: why the file is wrong; "" if it is not.
         loss_db: the PSNR of a lossy file where it calls for a warning, else None.
         median_position_error: in world units.
+        unchecked: what the independent reader does not understand, where the file is its own
+            original; "" if it was compared.
     """
 
     splats: int
@@ -63,6 +66,7 @@ class Proof:
     fault: str = ""
     loss_db: float | None = None
     median_position_error: float = 0.0
+    unchecked: str = ""
 
 
 def cameras_for(splats: Splats, views: Sequence[View] = ()) -> tuple[Camera, ...]:
@@ -118,7 +122,9 @@ class Prover:
                 code,
                 given=f"{path} came out wrong: {proof.fault}.",
                 wanted="A file that another program reads as the same splats.",
-                hint="Write another format, and report this with the file that was read.",
+                hint=f"{ENLARGE}."
+                if _size_loss(format_of(path), self.splats)
+                else "Write another format, and report this with the file that was read.",
             )
         return proof
 
@@ -147,6 +153,10 @@ class Prover:
         try:
             content = _drawable(checks.read_back(path))
             errors = checks.CHECKS[row.ending].validate(path)
+        except NotCrossCheckedError as error:
+            if exact:
+                return Proof(len(self.splats), {}, unchecked=str(error))
+            return Proof(0, {}, f"another reader does not understand {error}")
         except Exception as error:  # whatever the reader raises: the file is wrong
             return Proof(0, {}, f"another reader refused it ({reason_of(error)})")
         count = len(content.splats)
@@ -171,6 +181,8 @@ class Prover:
             "worst_splat": found.worst_row,
         }
         fault = diagnosis.explain(self.splats, content, found)
+        if "log_scale" in found.wrong and (loss := _size_loss(BY_ENDING[names[0]], self.splats)):
+            fault = f"{fault} (the format {loss})"
         if not lossy and worst < _MIN_LOSSLESS_DB:
             drawn = f"drawn again it differs by {worst:.1f} dB"
             fault = f"{drawn}; {fault}" if fault else drawn
@@ -226,6 +238,10 @@ def _drawable(content: FileContent) -> FileContent:
     readers."""
     with nonfinite_allowed():
         return replace(content, splats=drop_undrawable(check_finite(content.splats))[0])
+
+
+def _size_loss(row: Format, splats: Splats) -> str:
+    return resolve_name(row.size_loss)(splats) if row.size_loss else ""
 
 
 _DROP = "`splat edit --drop-floaters` removes outliers"

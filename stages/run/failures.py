@@ -10,6 +10,7 @@ from stages.base.errors import Family, ResourceError, SplatError
 from stages.base.text import printable, printable_name, reason_of
 
 _DENIED = {errno.EACCES, errno.EPERM, errno.EROFS}
+_PATH_LENGTH = 4096  # what is longer is the content of a file
 _USER = (Family.USAGE, Family.INPUT, Family.RUN_FOLDER)
 _MEMORY_WORDS = (
     "can't allocate memory",
@@ -43,7 +44,9 @@ def as_splat_error(error: BaseException, doing: str, folder: Path) -> SplatError
         if isinstance(link, OSError) and link.errno in _DENIED:
             return not_permitted(Path(link.filename or folder), link)
         if isinstance(link, UnicodeEncodeError) and printable(link.object) != link.object:
-            what = f"{printable_name(link.object)} has a name that is not UTF-8."
+            path = len(link.object) <= _PATH_LENGTH
+            name = printable_name(link.object) if path else f"Something in {printable(str(folder))}"
+            what = f"{name} has a name that is not UTF-8."
             return _unusable_name("name-not-utf-8", what)
         if isinstance(link, OSError) and link.errno == errno.ENAMETOOLONG:
             what = f"{link.filename or folder}: the name or the whole path is too long."

@@ -476,11 +476,17 @@ def test_names_reach_the_terminal_without_control_characters(splat, pretend) -> 
     assert "\x1b" not in splat(*words, "--json").output
 
 
-def test_name_that_a_library_cannot_use_is_an_error_in_words(splat, pretend) -> None:
+@pytest.mark.parametrize(
+    ("refused", "shown"), [("bad\udcff.usdc", r"bad\xff.usdc has"), ("<p>\udcff" * 9999, "has")]
+)
+def test_name_that_a_library_cannot_use_is_an_error_in_words(
+    splat, pretend, refused: str, shown: str
+) -> None:
     def refuse(inputs, settings, folder, report) -> None:
-        "bad\udcff.usdc".encode()
+        refused.encode()
 
     pretend["export"] = refuse
     result = splat("process", "photos")
     assert result.exit_code == 3
-    assert r"bad\xff.usdc has a name that is not UTF-8" in result.stderr
+    assert f"{shown} a name that is not UTF-8" in result.stderr
+    assert "<p>" not in result.stderr

@@ -182,6 +182,24 @@ def test_a_missing_or_damaged_file_leaves_nothing_behind(tmp_path: Path) -> None
     (tmp_path / "a.spz").write_bytes(b"\x1f\x8bnonsense")
     converted(tmp_path / "a.spz", tmp_path / "b.ply", code=3)
     assert not (tmp_path / "b.ply").exists()
+    converted(tmp_path / "a.spz", tmp_path / "new" / "b.ply", code=3)
+    assert not (tmp_path / "new").exists()
+
+
+def test_no_splats_are_not_written_as_a_file_of_no_bytes(tmp_path: Path) -> None:
+    formats.write(tmp_path / "a.ply", many_splats(0))
+    _, err = converted(tmp_path / "a.ply", tmp_path / "b.splat", code=2)
+    assert "convert-nothing" in err
+    assert not (tmp_path / "b.splat").exists()
+    converted(tmp_path / "a.ply", tmp_path / "b.spz")
+
+
+@pytest.mark.parametrize("name", ["scan 12:30.gltf", "50% #1?.gltf", "bad\udcff.html"])
+def test_an_unusual_name_of_a_file_is_written_and_read(tmp_path: Path, name: str) -> None:
+    formats.write(tmp_path / "a.ply", many_splats(20))
+    converted(tmp_path / "a.ply", tmp_path / name)
+    converted(tmp_path / name, tmp_path / "back.ply")
+    assert len(formats.read(tmp_path / "back.ply")) == 20
 
 
 def test_help_names_every_ending() -> None:

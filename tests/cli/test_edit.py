@@ -122,6 +122,7 @@ def test_a_dry_run_reports_the_removal_and_writes_nothing(source: Path, tmp_path
     assert f"--keep x > 0: 300 -> {kept} splats" in err
     assert f"--decimate 10: {kept} -> 10 splats" in err
     assert "Nothing was written" in err
+    edited(source, tmp_path / "new" / "x.spz", "--max-mb", "0.002", "--dry-run")
     assert sorted(tmp_path.iterdir()) == before
 
 
@@ -226,8 +227,23 @@ def test_splats_that_no_viewer_can_draw_are_left_out_first(source: Path, tmp_pat
     content = source.read_bytes()
     huge = np.float32(60).tobytes()  # exp(60) cannot be squared in float32
     source.write_bytes(content[:-20] + huge + content[-16:])
-    edited(source, tmp_path / "b.ply", "--decimate", "50%")
+    _, err = edited(source, tmp_path / "b.ply", "--decimate", "50%")
     assert len(result_of(tmp_path / "b.ply")) == 150
+    assert "no viewer can draw: 1 splat." in " ".join(err.split())
+
+
+def test_what_the_new_file_cannot_hold_is_reported(source: Path, tmp_path: Path) -> None:
+    far = replace(result_of(source).with_antialias(True), origin=np.array([1e6, 2e6, 3.0]))
+    formats.write(source, far)
+    _, err = edited(source, tmp_path / "b.spz", "--quiet")
+    assert "b.spz.offset.json" in err
+    out, _ = edited(source, tmp_path / "b.splat", "--json")
+    drawing, origin = json.loads(out.splitlines()[-1])["warnings"]
+    assert "antialiased drawing" in drawing
+    assert "b.splat.offset.json" in origin
+    out, _ = edited(source, tmp_path / "b.glb", "--scale", "1e9", "--scale", "1e9", "--json")
+    last = json.loads(out.splitlines()[-1])
+    assert last["splats"] + last["dropped"] == 300
 
 
 def test_a_file_can_be_edited_in_its_place_and_through_the_disk(

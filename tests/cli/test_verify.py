@@ -173,6 +173,14 @@ def test_a_file_without_a_run_is_compared_with_itself_and_says_so(
     assert events(tmp_path / "a.spz")[-1]["against"] == "itself"
 
 
+def test_what_the_second_reader_does_not_understand_is_no_failure() -> None:
+    path = Path(__file__).parents[1] / "formats" / "spz4" / "gsply_degree_2.spz"
+    out, err = verified(path)
+    assert "not cross-checked" in out
+    assert "does not understand SPZ version 4" in " ".join(err.split())
+    assert events(path)[-1]["right"] is None
+
+
 def test_a_visible_loss_is_a_warning_and_no_failure(scene: SmallScene, tmp_path: Path) -> None:
     sh = scene.splats.sh.copy()
     sh[:, 1:] = np.random.default_rng(0).normal(0, 1.5, sh[:, 1:].shape)

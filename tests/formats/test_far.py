@@ -140,6 +140,27 @@ def test_a_damaged_place_is_an_error(tmp_path: Path, damage: dict[str, Any]) -> 
     assert raised.value.code == "splats-unreadable"
 
 
+@pytest.mark.parametrize("content", ["[]", "5", '{"offset": {}}'])
+def test_a_damaged_offset_is_an_error(tmp_path: Path, content: str) -> None:
+    formats.write(tmp_path / "a.spz", replace(many_splats(5), origin=UTM))
+    (tmp_path / "a.spz.offset.json").write_text(content)
+    with pytest.raises(SplatError) as raised:
+        formats.read(tmp_path / "a.spz")
+    assert raised.value.code == "splats-unreadable"
+
+
+@pytest.mark.parametrize("name", list(formats.BY_ENDING))
+def test_metres_survive_every_format_that_can_say_so(tmp_path: Path, name: str) -> None:
+    row = formats.BY_ENDING[name]
+    path = tmp_path / row.file_name("a")
+    far = replace(many_splats(30), origin=UTM)
+    for units in ("metres", "arbitrary"):
+        formats.write(path, far, units=units)
+        assert formats.units_of(path) == units
+    formats.write(path, replace(far, origin=np.zeros(3)), units="metres")
+    assert (formats.units_of(path) == "metres") == row.holds_origin
+
+
 def test_what_lies_near_zero_is_left_where_it_is() -> None:
     means = many_splats(50).means.astype(np.float64) + np.array([900, -20, 3])
     near, origin = recentred(means, np.array([1.0, 2.0, 3.0]))

@@ -108,3 +108,13 @@ def test_a_huge_splat_does_not_take_the_steps_from_all_others(tmp_path: Path) ->
     back = formats.read(tmp_path / "a.quantised.glb")
     np.testing.assert_allclose(back.log_scales, splats.log_scales, atol=1e-6)
     np.testing.assert_array_equal(back.means[0], MEAN)
+
+
+def test_a_splat_too_far_for_small_units_leaves_the_positions_as_they_are(tmp_path: Path) -> None:
+    splats = red_splat().take(np.zeros(9, int))
+    splats.log_scales[:] -= 8.0
+    splats.means[4] = 3e38
+    formats.write(tmp_path / "a.quantised.glb", splats)
+    document, _ = glb_parts(tmp_path / "a.quantised.glb")
+    assert "scale" not in document["nodes"][0]
+    np.testing.assert_array_equal(formats.read(tmp_path / "a.quantised.glb").means[0], MEAN)

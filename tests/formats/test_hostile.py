@@ -244,6 +244,7 @@ def test_a_glb_that_lies_is_refused(tmp_path: Path, edit: Edit) -> None:
         "//example.com/a.bin",
         "..\\secret.bin",
         "C:/secret.bin",
+        "C%3A/secret.bin",
         "link.bin",
         "",
         ".",

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from stages import formats
-from stages.base.errors import SplatError
+from stages.base.errors import Family, SplatError
 from stages.editing import levels
 from stages.formats import sog, streamed_sog
 from stages.formats.values import drawable_rows
@@ -123,6 +123,42 @@ def test_an_asset_takes_the_place_of_an_earlier_one(asset: Path) -> None:
     assert row.size_bytes(asset) == sum(p.stat().st_size for p in asset.parent.rglob("*.*")) - 4
 
 
+def test_an_asset_removes_and_counts_nothing_that_the_earlier_one_does_not_name(
+    asset: Path,
+) -> None:
+    mine = [asset.parent / name for name in ("2024_05/photo.webp", "0_0/notes.txt")]
+    for path in mine:
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("mine")
+    levels.write(asset, many_splats(100))
+    assert [path.read_text() for path in mine] == ["mine", "mine"]
+    assert len(formats.read(asset)) == 100
+    assert {path.name for path in asset.parent.iterdir() if path.is_dir()} == {"0_0", "2024_05"}
+    assert mine[0] not in formats.format_of(asset).files(asset)
+
+
+@pytest.mark.parametrize("earlier", [None, "no JSON", "5", '{"filenames": ["../0_0/meta.json"]}'])
+def test_a_folder_of_the_user_s_is_refused_before_anything_changes(
+    tmp_path: Path, earlier: str | None
+) -> None:
+    path = tmp_path / "lod-meta.json"
+    (tmp_path / "0_0").mkdir()
+    (tmp_path / "0_0" / "photo.jpg").write_text("mine")
+    if earlier is not None:
+        path.write_text(earlier)
+    before = {file: file.read_bytes() for file in tmp_path.rglob("*.*")}
+    with pytest.raises(SplatError) as refused:
+        levels.write(path, many_splats(100))
+    assert (refused.value.code, refused.value.family) == ("lod-folder-taken", Family.USAGE)
+    assert {file: file.read_bytes() for file in tmp_path.rglob("*.*")} == before
+
+
+def test_chunks_that_an_interrupted_write_left_are_replaced(asset: Path) -> None:
+    asset.unlink()
+    levels.write(asset, many_splats(100))
+    assert len(formats.read(asset)) == 100
+
+
 def test_no_splats_at_all_are_an_asset_too(tmp_path: Path) -> None:
     levels.write(tmp_path / "lod-meta.json", many_splats(5).take(slice(0)))
     assert len(formats.read(tmp_path / "lod-meta.json")) == 0
@@ -169,6 +205,7 @@ def lod(meta: dict[str, Any]) -> dict[str, Any]:
         lambda meta: lod(meta).update(count=10**9),
         lambda meta: lod(meta).update(count="many"),
         lambda meta: lod(meta).pop("offset"),
+        lambda meta: leaves(meta)[0]["lods"].update({"0": 5}),
         lambda meta: leaves(meta)[0]["lods"].update(first={}),
         lambda meta: meta["tree"]["children"].append(meta["tree"]["children"][0]),
         lambda meta: meta["tree"].update(children=[3]),

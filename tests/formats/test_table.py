@@ -18,7 +18,10 @@ from stages.surface.table import MESHES, MeshFormat
 from tests.formats.files import read
 from tests.formats.truth import many_splats
 
-PLACES = ("writer", "reader", "independent_reader", "order", "quantiser", "position_loss")
+PLACES = (
+    *("writer", "reader", "units", "independent_reader", "order", "quantiser", "parts"),
+    *("position_loss", "size_loss"),
+)
 ROWS: list[Format | MeshFormat] = [*BY_ENDING.values(), *MESHES.values()]
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import base64
+import json
+import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,12 +14,16 @@ import pytest
 from plyfile import PlyData
 
 from stages import formats
+from stages.base.errors import SplatError
 from stages.formats import splat32
+from stages.formats.losses import losses_of
+from stages.formats.values import check_finite
 from stages.proof import independent_readers
 from stages.proof import prover as proving
 from stages.proof.checks import read_back
 from stages.proof.prover import Proof, Prover, cameras_for
 from stages.scene import Splats
+from tests.formats.files import read
 from tests.small_scene import SmallScene, small_scene
 
 Change = Callable[[Splats], Splats]
@@ -220,6 +227,71 @@ def test_a_file_that_must_equal_itself_is_held_to_more(
     assert "drawn again it differs" in dimmed.prove(path, exact=True).fault
 
 
+def in_itself(path: Path) -> None:
+    """Rewrite a .gltf with its buffer inside."""
+    document = json.loads(path.read_text())
+    body = base64.b64encode(path.with_suffix(".bin").read_bytes()).decode()
+    document["buffers"][0]["uri"] = "data:application/octet-stream;base64," + body
+    path.write_text(json.dumps(document))
+
+
+def of_postshot(path: Path) -> None:
+    path.write_bytes(path.read_bytes().replace(b"SplatRenderMode: mip", b"antialiased 1"))
+
+
+def without_note(path: Path) -> None:
+    text = path.read_text()
+    path.write_text(text[: text.index("customLayerData")] + text[text.index("defaultPrim") :])
+
+
+def of_splat_transform(path: Path) -> None:
+    with zipfile.ZipFile(path) as package:
+        members = {name: package.read(name) for name in package.namelist()}
+    meta = json.loads(members["meta.json"])
+    del meta["antialias"]
+    with zipfile.ZipFile(path, "w") as package:
+        for name, content in (members | {"meta.json": json.dumps(meta)}).items():
+            package.writestr(name, content)
+
+
+def renamed(path: Path) -> None:
+    formats.write(path.with_name("b.compressed.ply"), formats.read(path))
+    path.with_name("b.compressed.ply").replace(path)
+
+
+def placed(path: Path) -> None:
+    document = json.loads(path.read_text())
+    document["nodes"][0]["translation"] = [1, 2, 3]
+    path.write_text(json.dumps(document))
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "unchecked"),
+    [
+        ("gltf", in_itself, ""),
+        ("gltf", placed, "nodes that place splats"),
+        ("ply", of_postshot, ""),
+        ("ply", renamed, ""),
+        ("sog", of_splat_transform, ""),
+        pytest.param("usda", without_note, "", marks=pytest.mark.slow),
+    ],
+)
+def test_a_file_of_another_program_is_right_or_not_cross_checked(
+    scene: SmallScene, tmp_path: Path, name: str, change: Callable[[Path], None], unchecked: str
+) -> None:
+    path = tmp_path / f"a.{name}"
+    formats.write(path, scene.splats.with_antialias(name != "usda"))
+    change(path)
+    splats = read(path)
+    prover = Prover.of(splats, cameras_for(splats))
+    proof = prover.prove(path, exact=True)
+    assert (proof.fault, proof.unchecked) == ("", unchecked)
+    if unchecked:  # as the copy of something else, it is no good
+        assert unchecked in prover.prove(path).fault
+    else:
+        assert proof.figures["verify_db"] > 45
+
+
 def test_flat_and_opaque_splats_are_numbers_to_both_readers(
     scene: SmallScene, tmp_path: Path
 ) -> None:
@@ -235,6 +307,31 @@ def test_flat_and_opaque_splats_are_numbers_to_both_readers(
     assert proof.fault == ""
     assert proof.splats == len(scene.splats)
     assert proof.figures["max_log_scale_error"] == 0
+
+
+@pytest.mark.parametrize("name", ["spz", "sog", "compressed.ply", "quantised.glb"])
+@pytest.mark.parametrize("thickness", [-16.0, -np.inf])
+def test_an_axis_too_thin_for_a_format_is_no_fault(
+    prover: Prover, scene: SmallScene, tmp_path: Path, name: str, thickness: float
+) -> None:
+    logs = scene.splats.log_scales.copy()
+    logs[:, 2] = thickness
+    flat = check_finite(replace(scene.splats, log_scales=logs))
+    found = written(Prover.of(flat, prover.cameras), tmp_path, name, flat)
+    assert found.fault == ""
+    assert found.figures["verify_db"] > 30
+
+
+def test_splats_smaller_than_a_format_holds_are_named_with_its_limit(
+    scene: SmallScene, tmp_path: Path
+) -> None:
+    tiny = scene.splats
+    tiny = replace(tiny, means=tiny.means / 1e4, log_scales=tiny.log_scales - np.log(1e4))
+    formats.write(tmp_path / "a.spz", tiny)
+    with pytest.raises(SplatError, match=r"holds sizes from 4\.5e-05 units") as wrong:
+        Prover.of(tiny, cameras_for(tiny)).require(tmp_path / "a.spz", "wrong")
+    assert "--scale" in wrong.value.hint
+    assert "4.5e-05" in losses_of(formats.BY_ENDING["spz"], "a.spz", tiny)["size"]
 
 
 def test_without_photographs_the_middle_of_the_splats_is_seen_from_three_sides(

@@ -52,8 +52,8 @@ def scene_data(
         levels: width of the splats of each level of detail of a streamed asset.
     """
     return {
-        "title": title,
-        "source": source,
+        "title": _in_utf8(title),
+        "source": _in_utf8(source),
         "count": len(splats),
         "units": units,
         "antialias": splats.draw_settings.antialias,
@@ -62,6 +62,11 @@ def scene_data(
         "bounds": _bounds(splats),
         "shots": [as_plain(shot, splats.means) for shot in shots],
     }
+
+
+def _in_utf8(name: str) -> str:
+    """The name of a file with escapes for bytes that are not UTF-8, which no page can hold."""
+    return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 
 def _bounds(splats: Splats) -> dict[str, list[float]]:
