@@ -33,7 +33,6 @@ def convert(
     from stages.base import scratch
     from stages.base.atomic import make_folder
     from stages.formats.losses import losses_of
-    from stages.formats.values import drop_undrawable
 
     rows = formats.format_of(source), formats.format_of(target)  # before any work is done
     begun = time.monotonic()
@@ -41,14 +40,14 @@ def convert(
     nearest = next(folder for folder in target.absolute().parents if folder.is_dir())
     with _progress() as begin, scratch.scratch_in(nearest, spare=True):
         begin(f"reading {source}")
-        splats = formats.read(source)
+        splats, dropped = formats.read_drawable(source)
         _refuse_nothing(source, target, splats)
         begin(f"writing {target}")
         make_folder(target.parent)
-        dropped = formats.write(target, splats, units=formats.units_of(source))
+        formats.write(target, splats, units=formats.units_of(source))
         warnings = [*losses_of(rows[1], target.name, splats).values()]
         begin(f"comparing {target}")
-        found, loss = _proven(source, target, drop_undrawable(splats)[0])
+        found, loss = _proven(source, target, splats)
         warnings += [loss] if loss else []
         if "plain_drawing_db" in found:
             db = found["plain_drawing_db"]
@@ -57,10 +56,10 @@ def convert(
     facts: dict[str, Any] = {
         "source": str(source),
         "target": str(target),
-        "splats": len(splats) - dropped,
+        "splats": len(splats),
         "dropped": dropped,
         "size_bytes": size,
-        "bytes_per_splat": round(size / max(1, len(splats) - dropped), 2),
+        "bytes_per_splat": round(size / max(1, len(splats)), 2),
         "seconds": round(time.monotonic() - begun, 2),
         **found,
         "warnings": warnings,
@@ -78,9 +77,8 @@ def convert(
 def _refuse_nothing(source: Path, target: Path, splats: Splats) -> None:
     """Raise SplatError "convert-nothing" where the new file would have no bytes at all."""
     from stages.formats import format_of
-    from stages.formats.values import drop_undrawable
 
-    if format_of(target).ending == "splat" and not len(drop_undrawable(splats)[0]):
+    if format_of(target).ending == "splat" and not len(splats):
         raise UsageError(
             "convert-nothing",
             given=f"{source} holds no splats that can be drawn.",

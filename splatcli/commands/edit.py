@@ -107,9 +107,11 @@ def _load_scene(source: Path, antialias: bool) -> EditedScene:
     from stages.measure.evaluation import load_evaluation_views
     from stages.scene import split_held_out
 
-    splats, pipeline = load_target(source, antialias=antialias)
+    splats, pipeline = load_target(source, strict=False, antialias=antialias)
     pipeline = pipeline or results.run_around(source)
     splats, dropped = drop_undrawable(splats)
+    if dropped > len(splats):
+        load_target(source, antialias=antialias)  # says which values are not finite
     if dropped and not console.mode.as_json:
         console.warn(f"Warning: {_LEFT_OUT.format(counted(dropped, 'splat'))}")
     if pipeline is None or pipeline.manifest("sfm") is None:

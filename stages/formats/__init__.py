@@ -102,6 +102,17 @@ def read(path: Path, *, strict: bool = True) -> Splats:
         return read_offset(path, row, splats)
 
 
+def read_drawable(path: Path) -> tuple[Splats, int]:
+    """(the splats of the file that can be drawn, the number of others). Raises SplatError as
+    `read`; a file with more splats that are not finite than others is unreadable."""
+    from stages.formats.values import drop_undrawable
+
+    splats, others = drop_undrawable(read(path, strict=False))
+    if others > len(splats):
+        read(path)
+    return splats, others
+
+
 def units_of(path: Path) -> str:
     """ "metres" where the file, or the one beside it that holds its origin, declares them as ours
     do; else "arbitrary". Raises SplatError as `format_of`, or "splats-unreadable"."""

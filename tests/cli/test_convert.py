@@ -48,6 +48,37 @@ def test_the_result_through_scratch_files_is_the_same(
     assert first.read_bytes() == again.read_bytes()
 
 
+def with_nan(path: Path, rows: slice) -> Path:
+    """A PLY of 20 splats whose x are not numbers in `rows`."""
+    formats.write(path, many_splats(20))
+    head, values = path.read_bytes().split(b"end_header\n", 1)
+    table = np.frombuffer(values, "<f4").reshape(20, 62).copy()
+    table[rows, 0] = np.nan
+    path.write_bytes(head + b"end_header\n" + table.tobytes())
+    return path
+
+
+@pytest.mark.parametrize("command", [["convert"], ["edit", "--scale", "2"]])
+def test_splats_that_are_not_finite_are_left_out_and_counted(
+    tmp_path: Path, command: list[str]
+) -> None:
+    source, target = with_nan(tmp_path / "a.ply", slice(3)), tmp_path / "b.spz"
+    words = [command[0], str(source), str(target), *command[1:]]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0, result.stderr
+    assert "3 splats" in result.stderr
+    assert len(formats.read(target)) == 17
+
+
+@pytest.mark.parametrize("command", [["convert"], ["edit", "--scale", "2"]])
+def test_a_file_with_hardly_a_finite_splat_is_damaged(tmp_path: Path, command: list[str]) -> None:
+    source, target = with_nan(tmp_path / "a.ply", slice(15)), tmp_path / "b.spz"
+    result = CliRunner().invoke(app, [command[0], str(source), str(target), *command[1:]])
+    assert result.exit_code == 3, result.stderr
+    assert "not finite" in result.stderr
+    assert not target.exists()
+
+
 def test_usd_is_read_and_written_too(tmp_path: Path) -> None:
     formats.write(tmp_path / "a.usdz", many_splats(20))
     converted(tmp_path / "a.usdz", tmp_path / "b.spz")
