@@ -102,7 +102,7 @@ class Clouds:
     def cull(self, model, remove_giants):
         return model
 
-    def grow(self, model, budget):
+    def grow(self, model, budget, threshold):
         self.made += 1
         more = new_model(*(a[:1].copy() for a in model.arrays))
         more.means[:] = 0.0, 0.0, 3.0
