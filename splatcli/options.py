@@ -14,7 +14,7 @@ from typing import Annotated, Any, get_args
 
 import typer
 
-from stages.base.settings import PANELS, Setting, settings_of
+from stages.base.settings import PANELS, UNSET, Setting, settings_of
 
 _METAVARS = {int: "N", float: "X", bool: None, Path: "PATH"}
 
@@ -109,7 +109,8 @@ def shown_default(setting: Setting) -> str | bool:
 def given_only(given: Mapping[str, Any]) -> dict[str, Any]:
     """What was typed: None and empty lists left out, lists as tuples, paths absolute."""
     typed = {name: value for name, value in given.items() if value is not None and value != []}
-    typed |= {n: value.absolute() for n, value in typed.items() if isinstance(value, Path)}
+    paths = {n: v for n, v in typed.items() if isinstance(v, Path) and v is not UNSET}
+    typed |= {name: path.absolute() for name, path in paths.items()}
     return {n: tuple(value) if isinstance(value, list) else value for n, value in typed.items()}
 
 

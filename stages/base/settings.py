@@ -25,6 +25,7 @@ from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, fields, replace
 from dataclasses import field as dataclass_field
 from functools import cache
+from pathlib import Path
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from stages.base.errors import SplatError, UsageError
@@ -35,7 +36,9 @@ PANELS = (
 )
 
 
-UNSET = object()  # a value that was taken back: the field gets its default
+# A value that was taken back: the field gets its default. It is a path, because versions of typer
+# before 0.29 make one of whatever else is given for a path; only this very object counts.
+UNSET = Path()
 
 
 @dataclass(frozen=True)
