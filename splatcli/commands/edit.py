@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from stages.editing.scene import EditedScene
     from stages.editing.syntax import ParsedOperation
 
-_LEFT_OUT = "Left out, because of values that no viewer can draw: {}."
-
 
 def edit(
     ctx: typer.Context,
@@ -74,10 +72,11 @@ def _edit(
     with ExitStack() as stack:
         if target.parent.is_dir():
             stack.enter_context(scratch.scratch_in(target.parent))
-        scene = _load_scene(source, row.drawn_antialiased)
+        scene, left_out = _load_scene(source, row.drawn_antialiased)
         before, start_db = len(scene.splats), scene.psnr_db()
         facts: dict[str, Any] = {"source": str(source), "splats_before": before}
-        steps = []
+        steps: list[dict[str, Any]] = []
+        warnings: list[str] = []
         for one, edited in operations.apply_operations(scene, prepared):
             steps.append(_report(one, len(scene.splats), edited))
             scene = edited
@@ -86,21 +85,22 @@ def _edit(
             facts |= {"psnr_before_db": round(start_db, 3), "psnr_db": _db(scene)}
         if not dry_run:
             views = scene.placed_views()
-            dropped = levels.write(target, scene.splats, units=scene.units, views=views)
-            facts |= {"splats": len(scene.splats) - dropped, "dropped": dropped}
+            unwritten = levels.write(target, scene.splats, units=scene.units, views=views)
+            left_out += unwritten
+            facts |= {"splats": len(scene.splats) - unwritten}
             facts |= {"target": str(target), "size_bytes": row.size_bytes(target)}
-            facts["warnings"] = [
-                *([_LEFT_OUT.format(counted(dropped, "splat"))] if dropped else []),
-                *losses_of(row, target.name, scene.splats).values(),
-            ]
+            warnings.extend(losses_of(row, target.name, scene.splats).values())
             if views:
                 facts |= _proven(source, target, scene)
-    return facts
+    if left_out:
+        what = counted(left_out, "splat")
+        warnings.append(f"Left out, because of values that no viewer can draw: {what}.")
+    return facts | {"dropped": left_out, "warnings": warnings}
 
 
-def _load_scene(source: Path, antialias: bool) -> EditedScene:
-    """The splats, with the photographs of their run if there is one. antialias: whether they may be
-    for antialiased drawing. Raises SplatError."""
+def _load_scene(source: Path, antialias: bool) -> tuple[EditedScene, int]:
+    """(the splats that can be drawn, with the photographs of their run if there is one; the number
+    of others). antialias: whether they may be for antialiased drawing. Raises SplatError."""
     from stages.editing.scene import EditedScene
     from stages.formats import units_of
     from stages.formats.values import drop_undrawable
@@ -112,18 +112,17 @@ def _load_scene(source: Path, antialias: bool) -> EditedScene:
     splats, dropped = drop_undrawable(splats)
     if dropped > len(splats):
         load_target(source, antialias=antialias)  # says which values are not finite
-    if dropped and not console.mode.as_json:
-        console.warn(f"Warning: {_LEFT_OUT.format(counted(dropped, 'splat'))}")
     if pipeline is None or pipeline.manifest("sfm") is None:
-        return EditedScene(splats, units_of(source))
+        return EditedScene(splats, units_of(source)), dropped
     found = pipeline.load("sfm")
     training, held = split_held_out(found.views)
     photographs = load_evaluation_views(found.folder, training, splats.draw_settings)
     evaluation = load_evaluation_views(found.folder, held, splats.draw_settings) or photographs
-    return EditedScene(
+    scene = EditedScene(
         *(splats, found.units, photographs, evaluation, found.views),
         backend=results.backend_of_run(pipeline),
     )
+    return scene, dropped
 
 
 def _proven(source: Path, target: Path, scene: EditedScene) -> dict[str, Any]:
@@ -161,7 +160,7 @@ def _report(parsed: ParsedOperation, before: int, scene: EditedScene) -> dict[st
 
 
 def _show(facts: dict[str, Any]) -> None:
-    for warning in facts.get("warnings", ()):
+    for warning in facts["warnings"]:
         console.warn(f"Warning: {warning}")
     result = f"{facts['splats']:,} splats, {facts['splats_before']:,} before"
     if "psnr_db" in facts:

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.base.bad_files import CAMERAS, BadFileError, reading
+from stages.base.errors import SplatError
 from stages.cameras.camera_file import (
     CameraFile,
     FilePoints,
@@ -127,9 +128,12 @@ def read_points(path: Path) -> FilePoints | None:
 
 
 def files(path: Path) -> list[Path]:
-    """The file, and that of its points. Raises SplatError "cameras-unreadable"."""
-    with reading(path, CAMERAS):
-        points = _file_of_points(path, _document(path))
+    """The file, and that of its points. A damaged one is alone: reading it says what is wrong."""
+    try:
+        with reading(path, CAMERAS):
+            points = _file_of_points(path, _document(path))
+    except SplatError:
+        points = None
     return [path] if points is None else [path, points]
 
 

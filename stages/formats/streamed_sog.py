@@ -35,6 +35,10 @@ from stages.scene.rotations import matrices_of
 LEAF, CHUNK_SPLATS = 1 << 15, 1 << 17  # splats of the finest level; of a chunk, about
 _META_LIMIT_BYTES, _DEEPEST, _MOST_LEVELS = 1 << 26, 64, 100
 _CHUNK = re.compile(r"([0-9]+_[0-9]+)/meta\.json")  # as `_write_chunks` names them: level, number
+_CHUNK_FILES = (
+    *("meta.json", "means_l.webp", "means_u.webp", "quats.webp", "scales.webp", "sh0.webp"),
+    *("shN_centroids.webp", "shN_labels.webp"),
+)
 _Rows = NDArray[np.intp]
 
 
@@ -143,13 +147,13 @@ def _refuse_taken(path: Path, partial: Path, earlier: set[Path]) -> None:
 def _holds_only_sog(folder: Path) -> bool:
     if folder.is_symlink() or not folder.is_dir():
         return False
-    return all(file.name == "meta.json" or file.suffix == ".webp" for file in folder.iterdir())
+    return all(file.name in _CHUNK_FILES for file in folder.iterdir())
 
 
 def _remove_chunk(folder: Path) -> None:
     """Remove the files of a SOG, and the folder if nothing else is in it."""
-    for file in [folder / "meta.json", *folder.glob("*.webp")]:
-        file.unlink(missing_ok=True)
+    for name in _CHUNK_FILES:
+        (folder / name).unlink(missing_ok=True)
     if not any(folder.iterdir()):
         folder.rmdir()
 

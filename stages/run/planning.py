@@ -127,8 +127,9 @@ class Planner:
                     files = depth_files.files_of(path)
                 else:
                     files = [path] if name in (MASKS, RIG_MASK) else files_of(path)
-            except SplatError:  # a folder that lost the files that made it one of cameras
-                if name not in known:
+            except SplatError as error:
+                # a folder that lost the files that made it one of cameras
+                if name not in known or error.code != "cameras-unknown":
                     raise
                 found[name] = known[name]
                 continue

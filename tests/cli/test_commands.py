@@ -16,6 +16,7 @@ from stages.base.errors import Interrupted, SplatError
 from stages.raster import torch_device
 from stages.raster.gpu import device as gpu
 from stages.run.lock import locked
+from tests.cameras.drawn import nerfstudio as drawn_transforms
 from tests.cameras.models import example
 
 STAGES = ("ingest", "sfm", "seed", "train", "prune", "quantise", "export")
@@ -310,6 +311,21 @@ def test_cameras_that_cannot_be_read_are_refused_before_anything_is_made(splat) 
         result = splat("process", "photos", "--cameras", name)
         assert code in result.stderr
         assert not Path("run").exists()
+
+
+def test_cameras_that_are_gone_after_their_stage_count_as_unchanged(splat) -> None:
+    example().write(Path("sparse/0"))
+    assert splat("process", "photos", "--cameras", "sparse/0").exit_code == 0
+    next(Path("sparse/0").glob("images.*")).unlink()
+    assert states(splat)["sfm"] == "finished"
+
+
+def test_cameras_that_were_damaged_after_their_stage_are_a_reason_to_run_again(splat) -> None:
+    path = drawn_transforms(Path())
+    assert splat("process", "photos", "--cameras", str(path)).exit_code == 0
+    path.write_text("{")
+    assert f"cameras file {path.name} changed" in reasons(splat)["sfm"]
+    assert "cameras-unreadable" not in splat("status").stderr
 
 
 def test_a_split_that_the_camera_file_has_not_is_refused_before_anything_is_made(splat) -> None:

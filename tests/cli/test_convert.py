@@ -68,6 +68,8 @@ def test_splats_that_are_not_finite_are_left_out_and_counted(
     assert result.exit_code == 0, result.stderr
     assert "3 splats" in result.stderr
     assert len(formats.read(target)) == 17
+    again = CliRunner().invoke(app, [*words, "--json"])
+    assert json.loads(again.stdout.splitlines()[-1])["dropped"] == 3
 
 
 @pytest.mark.parametrize("command", [["convert"], ["edit", "--scale", "2"]])

@@ -140,7 +140,7 @@ def test_where_cameras_are_known_what_is_written_is_proven(
 ) -> None:
     camera = scenes.camera(matrix=look_at(np.array([0.0, -1.0, -9.0]), np.zeros(3)))
     known = EditedScene(result_of(source), views=(View("a", "", camera),))
-    monkeypatch.setattr(command, "_load_scene", lambda path, antialias: known)
+    monkeypatch.setattr(command, "_load_scene", lambda path, antialias: (known, 0))
     _, err = edited(source, tmp_path / "b.ply", "--scale", "2", "--rotate", "x:30")
     assert "read back and drawn again" in err
     out, _ = edited(source, tmp_path / "b.glb", "--move", "1,0,0", "--json")

@@ -126,7 +126,7 @@ def test_an_asset_takes_the_place_of_an_earlier_one(asset: Path) -> None:
 def test_an_asset_removes_and_counts_nothing_that_the_earlier_one_does_not_name(
     asset: Path,
 ) -> None:
-    mine = [asset.parent / name for name in ("2024_05/photo.webp", "0_0/notes.txt")]
+    mine = [asset.parent / name for name in ("2024_05/photo.webp", "0_0/photo.webp")]
     for path in mine:
         path.parent.mkdir(exist_ok=True)
         path.write_text("mine")
@@ -143,7 +143,7 @@ def test_a_folder_of_the_user_s_is_refused_before_anything_changes(
 ) -> None:
     path = tmp_path / "lod-meta.json"
     (tmp_path / "0_0").mkdir()
-    (tmp_path / "0_0" / "photo.jpg").write_text("mine")
+    (tmp_path / "0_0" / "photo.webp").write_text("mine")
     if earlier is not None:
         path.write_text(earlier)
     before = {file: file.read_bytes() for file in tmp_path.rglob("*.*")}
