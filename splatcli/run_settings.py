@@ -26,7 +26,7 @@ _OF_ONE_CAPTURE = (
 
 def presets() -> Mapping[str, Any]:
     """Training settings by preset name."""
-    from stages.train import PRESETS
+    from stages.train.stage import PRESETS
 
     found: Mapping[str, Any] = PRESETS
     return found

@@ -19,5 +19,5 @@ def load_stage(name: str) -> Stage:
     """
     if name not in STAGE_NAMES:
         raise KeyError(name)
-    stage: Stage = importlib.import_module(f"stages.{name}").STAGE
+    stage: Stage = importlib.import_module(f"stages.{name}.stage").STAGE
     return stage

@@ -14,9 +14,12 @@ def main() -> None:
     if cache.are_compiled():
         return
     print("compiling kernels, once ...", flush=True)
-    from stages import export, prune, quantise, train
     from stages.base.stage import Report
-    from stages.surface import fuse
+    from stages.export import stage as export
+    from stages.mesh import fuse
+    from stages.prune import stage as prune
+    from stages.quantise import stage as quantise
+    from stages.train import stage as train
     from tests.small_scene import small_scene
 
     fuse.VOXELS = 32**3  # what types are compiled counts, not sizes

@@ -19,8 +19,8 @@ from stages.base.settings import settings_of
 from tests.layers import LAYERS
 
 if TYPE_CHECKING:
+    from stages.formats.mesh_table import MeshFormat
     from stages.formats.table import Format
-    from stages.surface.table import MeshFormat
 
 ROOT = Path(__file__).parent.parent
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
@@ -71,7 +71,7 @@ def stages() -> str:
         rows.append(
             (
                 f"`{number}-{name}`",
-                f"`stages/{name}.py`",
+                f"`stages/{name}/stage.py`",
                 ", ".join(stage.reads) or "the photographs",
                 str(stage.version),
                 ", ".join(f"`{setting.flag}`" for setting in settings_of(stage.settings_type)),
@@ -81,8 +81,8 @@ def stages() -> str:
 
 
 def _formats() -> list[Format | MeshFormat]:
+    from stages.formats.mesh_table import MESHES
     from stages.formats.table import TABLE
-    from stages.surface.table import MESHES
 
     return [*TABLE, *MESHES.values()]
 
@@ -97,9 +97,9 @@ def formats() -> str:
 
 
 def format_modules() -> str:
+    from stages.formats.mesh_table import MESHES
     from stages.formats.table import TABLE
     from stages.proof.checks import CHECKS
-    from stages.surface.table import MESHES
 
     rows: list[tuple[str, ...]] = []
     for row in TABLE:
@@ -138,7 +138,7 @@ def backends() -> str:
 
 
 def presets() -> str:
-    from stages.train import PRESETS
+    from stages.train.stage import PRESETS
 
     rows: list[tuple[str, ...]] = []
     for name, preset in PRESETS.items():

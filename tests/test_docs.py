@@ -15,7 +15,7 @@ from splatcli.app import app
 from stages import STAGE_NAMES
 from stages.base.distribution import VERSION
 from stages.formats.table import TABLE
-from stages.train import PRESETS
+from stages.train.stage import PRESETS
 from tests.docs_commands import bash_lines, inline_commands, splat_commands
 from tests.docs_tables import PAGES, ROOT, renewed
 

@@ -13,9 +13,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stages import export, prune, quantise, seed, train
 from stages.base.stage import Report
+from stages.export import stage as export
+from stages.prune import stage as prune
+from stages.quantise import stage as quantise
 from stages.scene import Reconstruction, View, split_held_out
+from stages.seed import stage as seed
+from stages.train import stage as train
 from tests.scenes import camera
 from tests.small_scene import small_scene
 

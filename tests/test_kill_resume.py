@@ -30,7 +30,7 @@ MIB, OTHER_MIB = 40.0, (60.0, 400.0)  # of which the first stops growth early
 IMPATIENT = """
 import sys
 import stages.base.memory as memory
-import stages.training.hooks as hooks
+import stages.train.hooks as hooks
 
 free_mib = float(sys.argv.pop(1))
 memory.available_mib = lambda: free_mib

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.layers import LAYERS, STAGE_FILES
+from tests.layers import LAYERS, STAGES
 
 ROOT = Path(__file__).parent.parent
 OURS = ("stages", "splatcli")
@@ -60,7 +60,7 @@ def imports_of(name: str, source: str, when: str = "ever", strings: bool = True)
 
 
 def package_of(module: str) -> str:
-    """ "stages.raster" for "stages.raster.cpu.blend"; stage files are packages of their own."""
+    """ "stages.raster" for "stages.raster.cpu.blend"."""
     top = module.split(".")
     return top[0] if top[0] == "splatcli" else ".".join(top[:2])
 
@@ -130,10 +130,13 @@ def test_no_package_holds_more_than_its_share_of_the_lines() -> None:
     assert share <= 0.15, f"{package} holds {share:.1%} of the lines"
 
 
-@pytest.mark.parametrize("stage", STAGE_FILES)
-def test_stages_never_import_each_other(stage: str) -> None:
-    others = {f"stages.{other}" for other in STAGE_FILES if other != stage}
-    assert not imports_of(stage, MODULES[f"stages.{stage}"].read_text("utf-8")) & others
+@pytest.mark.parametrize(
+    "name", [name for name in MODULES if name.split(".")[1:2] and name.split(".")[1] in STAGES]
+)
+def test_a_stage_uses_modules_of_earlier_stages_and_never_the_stage_itself(name: str) -> None:
+    own = package_of(name)
+    others = {f"stages.{stage}.stage" for stage in STAGES} - {f"{own}.stage"}
+    assert not imports_of(name, MODULES[name].read_text("utf-8")) & others
 
 
 def test_nothing_below_imports_the_command() -> None:

@@ -15,10 +15,10 @@ from PIL import Image
 
 from sample_captures import make
 from sample_captures.render import Lens, Light, photograph
-from stages import sfm
 from stages.run.manifest import plain
 from stages.scene import Reconstruction
 from stages.scene.rotations import similarity
+from stages.sfm import stage as sfm
 
 CAPTURE = Path(__file__).parents[1] / "sample_captures" / "still_life"
 IMAGES = sorted((CAPTURE / "images").iterdir())

@@ -16,7 +16,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 CODE = ("stages", "splatcli")
 EVERYWHERE = (*CODE, "docs", "README.md")
-TRAINING = ("stages/training", "stages/train.py", "stages/capacity", "stages/prune.py")
+TRAINING = ("stages/train", "stages/prune", "stages/quantise")
 SUFFIXES = (".py", ".md", ".js", ".html", ".css")
 
 

@@ -15,7 +15,7 @@ from stages.run.pipeline import Pipeline
 from stages.run.planning import PHOTOS
 
 if TYPE_CHECKING:
-    from stages.measure.tradeoff.comparison import Candidate
+    from stages.tradeoff.comparison import Candidate
 
 
 def compare(
@@ -30,7 +30,7 @@ def compare(
     Both are evaluated at one size, view by view, on photographs that neither was trained on.
     """
     from stages.base.atomic import make_folder
-    from stages.measure.tradeoff.comparison import (
+    from stages.tradeoff.comparison import (
         compare_runs,
         distinct_name,
         fact_rows,
@@ -83,7 +83,7 @@ def _check_photographs(first: Pipeline, second: Pipeline) -> None:
 
 
 def _side(run: Pipeline, name: str) -> Candidate:
-    from stages.measure.tradeoff.comparison import Candidate
+    from stages.tradeoff.comparison import Candidate
 
     splats = results.final_splats(run)
     facts = {"splats": f"{len(splats):,}", "SH degree": str(splats.sh_degree)}

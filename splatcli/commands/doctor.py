@@ -128,7 +128,7 @@ def _gpu() -> str:
 def _photograph_formats() -> str:
     from PIL import Image
 
-    from stages.photos.decode import FORMATS, readers_set_up
+    from stages.ingest.decode import FORMATS, readers_set_up
 
     with readers_set_up():
         return ", ".join(name for name in FORMATS if name in Image.OPEN)

@@ -102,9 +102,9 @@ def _load_scene(source: Path, antialias: bool) -> tuple[EditedScene, int]:
     """(the splats that can be drawn, with the photographs of their run if there is one; the number
     of others). antialias: whether they may be for antialiased drawing. Raises SplatError."""
     from stages.editing.scene import EditedScene
+    from stages.evaluate.evaluation import load_evaluation_views
     from stages.formats import units_of
     from stages.formats.values import drop_undrawable
-    from stages.measure.evaluation import load_evaluation_views
     from stages.scene import split_held_out
 
     splats, pipeline = load_target(source, strict=False, antialias=antialias)

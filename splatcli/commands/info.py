@@ -101,7 +101,7 @@ def _memory(splats: Splats) -> dict[str, Any]:
 def _speed(splats: Splats, pipeline: Pipeline | None) -> dict[str, Any]:
     """Frames a second from some of the photographs' cameras, at the size of the training; from
     cameras around the splats if there are no photographs."""
-    from stages.measure.evaluation import seconds_per_frame
+    from stages.evaluate.evaluation import seconds_per_frame
     from stages.scene.framing import orbit_cameras
 
     console.note_compiling()

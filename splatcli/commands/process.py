@@ -34,7 +34,7 @@ def process(
     Finished work is kept: after an interruption the same command goes on where it stopped.
     """
     from stages.cameras.table import read_cameras
-    from stages.structure.match_cameras import check_split
+    from stages.sfm.known.match_cameras import check_split
 
     run_folder, photos = _run_folder_and_photos(photos, out)
     pipeline = distribute(Pipeline(run_folder, photos), cluster)

@@ -16,8 +16,8 @@ from stages.run import results
 from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:
-    from stages.measure.tradeoff.measurement import TradeoffInputs
     from stages.scene import Splats
+    from stages.tradeoff.measurement import TradeoffInputs
 
 
 def tradeoff(
@@ -34,8 +34,8 @@ def tradeoff(
     --max-splats` does.
     """
     from stages.base.atomic import make_folder
-    from stages.measure.tradeoff.measurement import measure_tradeoff
-    from stages.measure.tradeoff.report import summarise, write_report
+    from stages.tradeoff.measurement import measure_tradeoff
+    from stages.tradeoff.report import summarise, write_report
 
     pipeline = Pipeline(find_run_folder(run))
     inputs = _inputs(pipeline)
@@ -60,10 +60,10 @@ def _inputs(pipeline: Pipeline) -> TradeoffInputs:
     """The splats, views and files to measure, of a finished run. Raises SplatError
     (stage-not-finished, run-half-anew, nothing-held-out)."""
     from stages.base.stage import Report
-    from stages.measure.evaluation import load_evaluation_views
-    from stages.measure.tradeoff.measurement import TradeoffInputs, floater_views
-    from stages.prune import pruner_of
+    from stages.evaluate.evaluation import load_evaluation_views
+    from stages.prune.stage import pruner_of
     from stages.scene import split_held_out
+    from stages.tradeoff.measurement import TradeoffInputs, floater_views
 
     splats = results.final_splats(pipeline)
     settings = splats.draw_settings

@@ -89,7 +89,7 @@ def verify(
 
 def _files(target: Path | None) -> list[Path]:
     """The file itself, or the exported files of a run except meshes, which hold no splats."""
-    from stages.surface.table import MESHES
+    from stages.formats.mesh_table import MESHES
 
     if target is not None and not target.is_dir():
         return [target]
@@ -139,7 +139,7 @@ def _of_run(run: Pipeline) -> _Original:
     """The splats that the run's export writes to a file, which may be fine-tuned for its format,
     then those that a conversion would write."""
     from stages.formats import format_of
-    from stages.formats.quantisation import splats_to_write
+    from stages.formats.sog_quantisation import splats_to_write
     from stages.formats.values import drop_undrawable
     from stages.proof.prover import cameras_for, provers_of
 

@@ -39,7 +39,7 @@ def begin(
     Raises SplatError, OSError.
     """
     from stages.scene import save_splats
-    from stages.structure.reconstruction_files import save_reconstruction
+    from stages.sfm.reconstruction_files import save_reconstruction
 
     folder.mkdir(parents=True, exist_ok=True)
     pipeline = Pipeline(folder)

@@ -83,8 +83,8 @@ class _BlockTraining:
         """The merged splats, written to `folder` as training writes them."""
         from stages.distributed import partition
         from stages.scene import draw_settings_of, split_held_out
-        from stages.train import save
-        from stages.training.build import corrects_light, corrects_vignetting
+        from stages.train.build import corrects_light, corrects_vignetting
+        from stages.train.stage import save
 
         started = time.monotonic()
         light = corrects_light(self.whole, self.settings.light, self.report)
@@ -120,8 +120,8 @@ class _BlockTraining:
         return trained
 
     def _evaluate(self, splats: Splats, held: Sequence[View], folder: Path) -> None:
-        from stages.measure.evaluation import image_renderer, load_evaluation_views
-        from stages.training.quality import write_history, write_quality
+        from stages.evaluate.evaluation import image_renderer, load_evaluation_views
+        from stages.train.quality import write_history, write_quality
 
         settings = splats.draw_settings
         views = load_evaluation_views(self.whole.folder, held, settings)
@@ -206,7 +206,7 @@ class _BlockTraining:
     ) -> NDArray[np.bool_]:
         """[N] which of a block's splats go into the merged scene: at most `most` of its cell."""
         from stages.distributed import merge
-        from stages.measure.evaluation import load_evaluation_views
+        from stages.evaluate.evaluation import load_evaluation_views
 
         own = cell.holds(splats.means)
         if own.sum() <= most:
@@ -262,10 +262,10 @@ class _BlockTraining:
         import numpy as np
 
         from stages.distributed import merge
-        from stages.measure.evaluation import load_evaluation_views
+        from stages.evaluate.evaluation import load_evaluation_views
         from stages.scene import TrainedSplats, training_extent
-        from stages.training.dropout import uses_dropout
-        from stages.training.finetune import FineTuner
+        from stages.train.dropout import uses_dropout
+        from stages.train.finetune import FineTuner
 
         degree, backend = self.settings.sh_degree, backend_of_settings(self.settings)
         splats, counts = merge.merge_blocks(

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.distributed.partition import Cell
+from stages.evaluate.contribution import measure_contributions, squared_error
+from stages.evaluate.evaluation import EvaluationView
 from stages.formats.values import concatenate
-from stages.measure.contribution import measure_contributions, squared_error
-from stages.measure.evaluation import EvaluationView
 from stages.scene import DrawSettings, Splats
-from stages.training.finetune import FineTuner
+from stages.train.finetune import FineTuner
 
 REACH = 3.0  # standard deviations to which a splat extends
 STEPS_PER_VIEW, MAX_STEPS = 24, 1200  # of fine-tuning the seams

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.measure.contribution import blend_weights
+from stages.evaluate.contribution import blend_weights
 from stages.scene import Camera, Reconstruction, Splats
 
 UNBOUNDED = 1e30  # world units: the outer sides of the outer cells (JSON has no infinity)

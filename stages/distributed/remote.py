@@ -245,7 +245,7 @@ class UploadListener(Listener):
             self._remote.put(self._local, [f"{self._partial}/{REQUEST}"])
 
     def progressed(self, stage: Stage, label: str, done: int, total: int, numbers: Numbers) -> None:
-        from stages.training.checkpoint import FILE_NAME
+        from stages.train.checkpoint import FILE_NAME
 
         name = f"{self._partial}/{FILE_NAME}"
         with suppress(OSError, SplatError):  # without a checkpoint, a resumed run repeats more

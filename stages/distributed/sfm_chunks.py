@@ -12,7 +12,7 @@ from stages.distributed.tasks import ChunkTask, Executor, OpenExecutor, Resource
 from stages.run.pipeline import Listener, Pipeline
 
 if TYPE_CHECKING:
-    from stages.structure.chunks import Chunk
+    from stages.sfm.worker.chunks import Chunk
 
 
 def with_chunks(pipeline: Pipeline, open_executor: OpenExecutor) -> Pipeline:
@@ -32,8 +32,8 @@ def with_chunks(pipeline: Pipeline, open_executor: OpenExecutor) -> Pipeline:
 def _execute(
     executor: Executor, report: Report, chunks: Sequence[Chunk], check: Callable[[], None]
 ) -> None:
-    """See `structure.chunks.ChunkExecutor`."""
-    from stages.structure.chunks import CHUNK_MEMORY_MIB
+    """See `sfm.worker.chunks.ChunkExecutor`."""
+    from stages.sfm.worker.chunks import CHUNK_MEMORY_MIB
 
     if not chunks:
         return

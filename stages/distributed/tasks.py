@@ -22,7 +22,7 @@ from stages.run.failures import as_splat_error
 from stages.run.pipeline import Listener, Pipeline
 
 if TYPE_CHECKING:
-    from stages.structure.chunks import Chunk
+    from stages.sfm.worker.chunks import Chunk
 
 _log = logging.getLogger(__name__)
 
@@ -84,7 +84,7 @@ class ChunkTask:
         return self.chunk.out.parent
 
     def run(self, listener: Listener | None = None) -> None:
-        from stages.structure.chunks import run_chunk
+        from stages.sfm.worker.chunks import run_chunk
 
         run_chunk(self.chunk)
 
@@ -108,7 +108,7 @@ class Resources:
 
 def resources_of(train: Any) -> Resources:
     """The most that a run with these training settings needs."""
-    from stages.training.cap import needed_mib
+    from stages.train.cap import needed_mib
 
     memory_mib = needed_mib(train.max_splats) if train.max_splats else None
     return Resources(memory_mib, gpus=int(train.backend == "gpu" or train.device == "cuda"))

@@ -20,8 +20,8 @@ from stages.editing.decimate import FAR_ROUND_SHARE, NEAR_ROUND_SHARE, decimate
 from stages.editing.scene import EditedScene
 from stages.editing.syntax import OPERATIONS, ParsedOperation
 from stages.editing.transform import Similarity
+from stages.evaluate.floaters import isolated_splats, near_camera_floaters
 from stages.formats.values import concatenate, drop_undrawable, select_rows
-from stages.measure.floaters import isolated_splats, near_camera_floaters
 from stages.scene import Splats
 
 Operation = Callable[[EditedScene], EditedScene]

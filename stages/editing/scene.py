@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from stages.editing.decimate import RemovalCosts
 from stages.editing.transform import Similarity
-from stages.measure.contribution import Contributions, measure_contributions, near_view_frusta
-from stages.measure.evaluation import EvaluationView, mean_psnr_db
+from stages.evaluate.contribution import Contributions, measure_contributions, near_view_frusta
+from stages.evaluate.evaluation import EvaluationView, mean_psnr_db
 from stages.raster.backends import AUTO
 from stages.scene import Camera, Splats, View
 

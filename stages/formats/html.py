@@ -19,8 +19,8 @@ from stages.base.bad_files import BadFileError
 from stages.base.blocks import report_progress
 from stages.formats import ply
 from stages.formats.inflate import check_size
-from stages.formats.page import document
-from stages.formats.page.cameras import page_cameras
+from stages.page import document
+from stages.page.cameras import page_cameras
 from stages.scene import Splats, View
 
 _GZIP = 31  # wbits of zlib for the gzip container, whose header then holds no time

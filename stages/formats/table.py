@@ -2,7 +2,7 @@
 
 This table lists what `stages.formats` itself reads and writes. How a file is checked by a parser
 that did not write it is listed in `stages.proof.checks`; the formats of meshes are listed in
-`stages.surface.files`. Both know their formats by the same endings.
+`stages.formats.mesh_files`. Both know their formats by the same endings.
 """
 
 from __future__ import annotations
@@ -191,7 +191,7 @@ TABLE = (
         reader="stages.formats.sog_read:read",
         units="stages.formats.sog_read:units",
         order="stages.scene.morton:morton_order",
-        quantiser="stages.formats.quantisation:quantise_for_sog",
+        quantiser="stages.formats.sog_quantisation:quantise_for_sog",
         position_loss="stages.formats.sog:position_loss",
         loses="has 256 sizes and colours, and a palette of view-dependent colours",
         needs_finetuning=True,

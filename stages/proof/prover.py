@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 from stages.base.blocks import blocks
 from stages.base.errors import QualityError
 from stages.base.text import counted, reason_of
+from stages.evaluate.image_metrics import IDENTICAL_DB, capped_psnr_db
 from stages.formats import BY_ENDING, Format, format_of
 from stages.formats.compressed_ply import outlier_shells
 from stages.formats.losses import ENLARGE
 from stages.formats.values import check_finite, drop_undrawable, nonfinite_allowed
-from stages.measure.image_metrics import IDENTICAL_DB, capped_psnr_db
 from stages.proof import checks, diagnosis
 from stages.proof.compare import differences
 from stages.proof.content import FileContent, NotCrossCheckedError

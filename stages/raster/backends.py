@@ -1,7 +1,7 @@
 """The list of rendering backends, and the choice among them.
 
 To add a backend: write a class with the methods of `definition.Rasteriser` and add one row to
-`BACKENDS`. A backend that also has training kernels gets a row in `training.step`; the others
+`BACKENDS`. A backend that also has training kernels gets a row in `train.steps.step`; the others
 train through `forward` and `backward`. Modules named in the list are imported at first use.
 
 A backend may run on several torch devices. Its full name then has the device after an "@":

@@ -102,8 +102,8 @@ class Planner:
         maps, and files that settings name. Named files that were removed after the stage finished
         count as unchanged."""
         from stages.cameras.table import files_of
-        from stages.photos import depth_files
-        from stages.photos.masks import mask_folder
+        from stages.ingest import depth_files
+        from stages.ingest.masks import mask_folder
 
         done = Manifest.read(self.layout.workspace(stage).final)
         known = done.input_files if done else {}

@@ -12,7 +12,7 @@ from stages.run.pipeline import Listener
 
 _STAGES_WITHOUT_KERNELS = ("ingest", "sfm", "seed")
 _TIMEOUT_S = 300.0
-_LAST_KERNEL = "gather_contributions"  # compiled last, see `training.compile_kernels`
+_LAST_KERNEL = "gather_contributions"  # compiled last, see `train.compile_kernels`
 
 
 class PrecompileListener(Listener):
@@ -49,7 +49,7 @@ class PrecompileListener(Listener):
 
         if cache.are_compiled(_LAST_KERNEL):
             return
-        command = python_module("stages.training.compile_kernels", self._backend)
+        command = python_module("stages.train.compile_kernels", self._backend)
         with suppress(OSError):
             self._process = start_child(command, subprocess.DEVNULL)
 

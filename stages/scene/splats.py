@@ -116,7 +116,7 @@ class TrainedSplats:
 
     Args:
         splats: what was trained.
-        dropout: whether some were dropped from each of the last steps (`training.dropout`).
+        dropout: whether some were dropped from each of the last steps (`train.dropout`).
         cameras: where training has refined them; None where it has not.
     """
 

@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 
 from stages.base.errors import SplatError
 from stages.base.stage import DrawView, Numbers
-from stages.formats.page import document
-from stages.formats.page.cameras import PageCamera
+from stages.page import document
+from stages.page.cameras import PageCamera
 from stages.scene import Camera, View
 from stages.scene.framing import median_depth
 from stages.viewer.server import Item, Response

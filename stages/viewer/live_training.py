@@ -39,7 +39,7 @@ class LiveTraining(Listener):
     def started(self, stage: Stage, number: int, reason: str, resumed: bool) -> None:
         if stage.name != _STAGE:
             return
-        from stages.formats.page.cameras import page_cameras
+        from stages.page.cameras import page_cameras
         from stages.viewer.live_page import LivePage
         from stages.viewer.server import LocalServer
 

@@ -8,8 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from stages.formats import format_of, streamed_sog
-from stages.formats.page import document
-from stages.formats.page.cameras import PageCamera, page_cameras
+from stages.page import document
+from stages.page.cameras import PageCamera, page_cameras
 from stages.scene import Splats, View
 from stages.viewer.server import Item
 

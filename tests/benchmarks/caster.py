@@ -1,4 +1,4 @@
-"""A compiled ray caster for `tests.structure.room_captures.picture`.
+"""A compiled ray caster for `tests.sfm.room_captures.picture`.
 
 It draws a thousand pictures of a hall of boxes in minutes instead of an hour.
 """

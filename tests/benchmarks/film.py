@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 
 from sample_captures.make import ARC_DEGREES, HERE, LENS, TARGET, look_at, scene
 from sample_captures.render import Array, hit, linear_to_srgb, srgb_to_linear, surface
-from stages import ingest, sfm
 from stages.base.stage import Report
+from stages.ingest import stage as ingest
 from stages.scene import Reconstruction
-from tests.structure.truth import centres, similarity
+from stages.sfm import stage as sfm
+from tests.sfm.truth import centres, similarity
 
 FRAMES, FPS, CRF = 300, 30, 20
 BLURRED_SHARE, BURST = 0.2, 5  # of the frames; frames in a row

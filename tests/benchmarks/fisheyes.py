@@ -27,14 +27,14 @@ from sample_captures.render import Array
 from stages.base.stage import Report
 from stages.cameras.lens import Lens
 from stages.cameras.undistortion import undistorted_camera
-from stages.measure.evaluation import image_renderer
-from stages.measure.image_metrics import capped_psnr_db
-from stages.photos.load import load_image
+from stages.evaluate.evaluation import image_renderer
+from stages.evaluate.image_metrics import capped_psnr_db
 from stages.scene import Camera, Photo, load_splats
 from stages.scene.capture import HELD_OUT_EVERY
+from stages.scene.pictures import load_image
 from stages.scene.rotations import quaternions_of
-from stages.structure.pinhole_views import PinholeView, write_pinhole_views
-from stages.structure.undistorted_images import IMAGES, PosedPhoto, mask_file
+from stages.sfm.known.pinhole_views import PinholeView, write_pinhole_views
+from stages.sfm.undistorted_images import IMAGES, PosedPhoto, mask_file
 from tests.benchmarks import panoramas
 
 SIDE = 800  # pixels; 255 a radian

@@ -34,12 +34,12 @@ from stages.raster.draw import render
 from stages.raster.gpu import device
 from stages.raster.gpu.rasteriser import DeviceScene, DeviceView, GpuRasteriser
 from stages.scene import Camera, Splats
-from stages.training.gpu_step import GpuStep
-from stages.training.loss import channel_means
-from stages.training.optimiser import LearningRates, new_model
-from stages.training.reference_step import reference_loss
-from stages.training.step import StepInput
-from stages.training.views import Level
+from stages.train.loss import channel_means
+from stages.train.optimiser import LearningRates, new_model
+from stages.train.steps.gpu import GpuStep
+from stages.train.steps.reference import reference_loss
+from stages.train.steps.step import StepInput
+from stages.train.views import Level
 from tests.benchmarks.scenes import random_scene, view
 from tests.scenes import PARAMETERS, camera, cloud, exact_gradients, gradients, relative
 from tests.tolerances import FLOAT32_GRADIENT, FLOAT32_IMAGE

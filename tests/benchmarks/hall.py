@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from sample_captures.make import look_at
 from sample_captures.render import Lens, Shape
 from tests.benchmarks.caster import Boxes
-from tests.structure.room_captures import prints
+from tests.sfm.room_captures import prints
 
 AROUND = 25  # photographs of a pillar
 APART, REACH = 3.0, 1.6  # metres between pillars, and from a pillar to the camera

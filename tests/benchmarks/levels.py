@@ -17,7 +17,7 @@ import numpy as np
 
 from stages import formats
 from stages.editing import levels
-from stages.measure.image_metrics import capped_psnr_db
+from stages.evaluate.image_metrics import capped_psnr_db
 from stages.raster.draw import raster_settings_of, renderer
 from stages.scene import Camera, Splats, look_at
 from stages.scene.framing import orbit_cameras

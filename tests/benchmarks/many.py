@@ -18,13 +18,13 @@ import numpy as np
 
 from sample_captures.make import HERE
 from stages.base.memory import PeakMemory, resident_mib
-from stages.measure.evaluation import EvaluationView, load_evaluation_view, load_evaluation_views
+from stages.evaluate.evaluation import EvaluationView, load_evaluation_view, load_evaluation_views
 from stages.raster.definition import RasterSettings
 from stages.scene import Camera, DrawSettings, View
-from stages.training import views as training_views
-from stages.training.optimiser import LearningRates, new_model
-from stages.training.step import StepInput, step_of
-from stages.training.views import load_views
+from stages.train import views as training_views
+from stages.train.optimiser import LearningRates, new_model
+from stages.train.steps.step import StepInput, step_of
+from stages.train.views import load_views
 from tests.scenes import camera, cloud
 
 SIZE = (1600, 1200)

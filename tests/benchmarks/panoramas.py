@@ -22,12 +22,12 @@ from PIL import Image
 
 from sample_captures import make, render
 from sample_captures.render import Array, Light, Shape
-from stages import sfm
-from stages.measure.evaluation import evaluate_at_sizes, image_renderer
+from stages.evaluate.evaluation import evaluate_at_sizes, image_renderer
 from stages.raster.kernels.simd import kernel
 from stages.scene import View, load_splats
+from stages.sfm import stage as sfm
 from tests.benchmarks.sample_test_views import evaluation_views
-from tests.structure.truth import centres, similarity
+from tests.sfm.truth import centres, similarity
 
 PANORAMAS = 12
 WIDTH = 3840  # 611 pixels a radian; the sample's photographs have 600

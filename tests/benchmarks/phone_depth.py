@@ -24,14 +24,14 @@ from sample_captures import make
 from sample_captures.render import Lens, Shape, hit
 from stages import load_stage
 from stages.base.stage import Report
-from stages.ingest import IngestSettings
-from stages.measure.evaluation import evaluate, image_renderer, load_evaluation_views
+from stages.evaluate.evaluation import evaluate, image_renderer, load_evaluation_views
+from stages.ingest.stage import IngestSettings
 from stages.run.pipeline import Pipeline
 from stages.scene import Splats, draw_settings_of, evenly_spaced
-from stages.train import PRESETS
+from stages.train.stage import PRESETS
 from tests.benchmarks.sample_test_views import PINHOLE, held_out_views_in, poses, render_test_views
 from tests.sample import PHOTOS
-from tests.structure.room_captures import picture
+from tests.sfm.room_captures import picture
 
 WIDTH, HEIGHT = 256, 192
 NOISE_M, NOISE = 0.003, 0.01  # standard deviation: metres, and share of the depth

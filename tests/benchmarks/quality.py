@@ -34,7 +34,7 @@ from stages import STAGE_NAMES, load_stage
 from stages.base.errors import SplatError
 from stages.base.stage import Report
 from stages.cameras.table import read_cameras
-from stages.measure.evaluation import (
+from stages.evaluate.evaluation import (
     SIZES,
     EvaluationView,
     evaluate_at_sizes,
@@ -43,9 +43,9 @@ from stages.measure.evaluation import (
 )
 from stages.run.pipeline import Pipeline
 from stages.scene import Reconstruction, Splats, draw_settings_of, split_held_out
-from stages.sfm import SfmSettings
-from stages.train import PRESETS, TrainSettings
-from stages.training.build import corrects_light, corrects_vignetting
+from stages.sfm.stage import SfmSettings
+from stages.train.build import corrects_light, corrects_vignetting
+from stages.train.stage import PRESETS, TrainSettings
 from tests.benchmarks.captures import SOURCES, photographs_of
 from tests.benchmarks.sample_test_views import evaluation_views
 from tests.benchmarks.verdicts import Cell, grouped, read, verdicts, write

@@ -17,7 +17,7 @@ from PIL import Image
 
 from sample_captures import make
 from sample_captures.render import Lens, Light, photograph
-from stages.measure.evaluation import EvaluationView, load_evaluation_views
+from stages.evaluate.evaluation import EvaluationView, load_evaluation_views
 from stages.scene import Camera, DrawSettings, Reconstruction, View
 from stages.scene.rotations import similarity
 

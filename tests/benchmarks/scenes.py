@@ -70,7 +70,7 @@ def equal_scene(n: int, side: int) -> tuple[Splats, Camera, np.ndarray]:
 def trained_scene(run: Path, long_side: int) -> tuple[Splats, Camera]:
     """The trained splats of a run folder, seen from its first photograph at `long_side` pixels."""
     from stages.scene import load_splats
-    from stages.sfm import load
+    from stages.sfm.stage import load
 
     splats = load_splats(run / "4-train")
     camera = load(run / "2-sfm").views[0].camera.fitted(long_side)

@@ -20,7 +20,7 @@ from stages import load_stage
 from stages.base.stage import Report
 from stages.run.pipeline import Pipeline
 from stages.scene import Reconstruction, View, split_held_out, training_extent
-from stages.train import TrainSettings
+from stages.train.stage import TrainSettings
 
 # (mean distance of the moves in extents of the scene, factor of the focal lengths)
 CASES = ((0.0, 1.0), (0.001, 1.0), (0.005, 1.0), (0.02, 1.0), (0.0, 1.01))

@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 from splatcli.folders import load_target
-from stages.measure.evaluation import EvaluationView, evaluate_at_sizes
+from stages.evaluate.evaluation import EvaluationView, evaluate_at_sizes
 from stages.raster.draw import raster_settings_of, renderer
 from stages.run import results
 from stages.scene import Splats

@@ -20,11 +20,11 @@ from stages.base.stage import Report
 from stages.raster.definition import gradient_columns
 from stages.raster.kernels.pool import Pool
 from stages.scene import Camera, DrawSettings, Splats
-from stages.training.loss import channel_means
-from stages.training.optimiser import Model, new_model
-from stages.training.schedule import SCALES, Schedule
-from stages.training.trainer import Trainer
-from stages.training.views import Level, TrainingView
+from stages.train.loss import channel_means
+from stages.train.optimiser import Model, new_model
+from stages.train.schedule import SCALES, Schedule
+from stages.train.trainer import Trainer
+from stages.train.views import Level, TrainingView
 from tests.benchmarks.gate import check_kernels
 from tests.benchmarks.scenes import PICTURES, random_scene, trained_scene, view
 from tests.benchmarks.timing import (

@@ -11,10 +11,10 @@ import pytest
 from PIL import Image
 
 from stages.cameras.table import read_cameras
-from stages.measure.evaluation import SIZES, EvaluationView
-from stages.measure.image_metrics import IDENTICAL_DB
+from stages.evaluate.evaluation import SIZES, EvaluationView
+from stages.evaluate.image_metrics import IDENTICAL_DB
 from stages.raster.draw import raster_settings_of, render
-from stages.sfm import SfmSettings
+from stages.sfm.stage import SfmSettings
 from tests.benchmarks import captures, quality, sizes
 from tests.benchmarks.captures import SOURCES, Source
 from tests.benchmarks.verdicts import Cell, read, verdicts, write

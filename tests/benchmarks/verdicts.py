@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from stages.measure.bootstrap import Difference, paired_difference
-from stages.measure.evaluation import SIZES
+from stages.evaluate.evaluation import SIZES
+from stages.tradeoff.bootstrap import Difference, paired_difference
 
 
 @dataclass(frozen=True)

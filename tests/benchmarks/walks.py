@@ -19,12 +19,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stages import ingest, sfm
 from stages.base.memory import PeakMemory
 from stages.base.stage import Numbers, Report
+from stages.ingest import stage as ingest
 from stages.scene import View
+from stages.sfm import stage as sfm
 from tests.benchmarks.hall import Walk, in_hall, through_run
-from tests.structure.truth import centres, similarity
+from tests.sfm.truth import centres, similarity
 
 ENDS = 10  # photographs at the beginning and at the end, whose places tell the drift
 REPORTED = (

@@ -10,7 +10,7 @@ import numpy as np
 from stages.cameras.camera_file import FilePoints
 from stages.cameras.colmap import Observations, write_model
 from stages.scene import Camera
-from tests.structure.synthetic import orbit_model
+from tests.sfm.synthetic import orbit_model
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from stages.base.errors import SplatError
 from stages.cameras.nerfstudio import write
 from stages.cameras.table import read_cameras, read_points
 from stages.scene import Camera, View, look_at
-from tests.structure.synthetic import random_rotation
+from tests.sfm.synthetic import random_rotation
 
 
 def camera(matrix: np.ndarray, fx: float = 500.0) -> Camera:

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from splatcli.app import app
 from stages import formats
 from stages.base import scratch
-from stages.surface.table import MESHES
+from stages.formats.mesh_table import MESHES
 from tests.cli.help_text import help_of
 from tests.formats.truth import many_splats
 

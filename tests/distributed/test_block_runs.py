@@ -17,7 +17,7 @@ from stages.distributed import blocks, partition
 from stages.distributed.tasks import SerialExecutor, TaskResult
 from stages.run.pipeline import Listener, Pipeline
 from stages.scene import save_splats, split_held_out
-from stages.structure.reconstruction_files import save_reconstruction
+from stages.sfm.reconstruction_files import save_reconstruction
 from tests.small_scene import small_scene
 
 pytestmark = pytest.mark.timeout(300)  # the first to train compiles kernels

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stages.distributed import merge, partition
-from stages.measure.evaluation import EvaluationView
+from stages.evaluate.evaluation import EvaluationView
 from stages.raster.backends import AUTO
 from stages.scene import Camera, look_at
 from tests import scenes

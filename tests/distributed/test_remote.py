@@ -16,11 +16,11 @@ from typing import Any
 
 import pytest
 
-from stages import train
 from stages.base.errors import SplatError
 from stages.distributed import remote
 from stages.run.request import REQUEST
 from stages.run.runfile import RUN_FILE
+from stages.train import stage as train
 from tests import processes, sample
 from tests.cli.pretence import failing_at
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stages.editing.decimate import Moments, RemovalCosts, decimate, merge
-from stages.measure.image_metrics import capped_psnr_db
+from stages.evaluate.image_metrics import capped_psnr_db
 from stages.raster.definition import ALPHA_MAX
 from stages.raster.draw import render
 from stages.scene import Camera, Splats, look_at

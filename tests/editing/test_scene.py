@@ -12,7 +12,7 @@ import pytest
 from stages.editing.operations import apply_operations, prepare_operations
 from stages.editing.scene import EditedScene
 from stages.editing.syntax import ParsedOperation
-from stages.measure.evaluation import EvaluationView
+from stages.evaluate.evaluation import EvaluationView
 from stages.raster.draw import render
 from stages.scene import Camera, DrawSettings, Splats, View, look_at
 from tests import scenes

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from stages import train
 from stages.base.stage import Report
 from stages.raster.definition import RasterSettings
 from stages.raster.draw import render
 from stages.scene import Camera, look_at, scene_extent
-from stages.training import build
+from stages.train import build
+from stages.train import stage as train
 from tests.extremes.measured import Measured, broken, difference, worst
 from tests.extremes.oracles import centre_in_picture, inside_clamp, means2d, textbook_picture
 from tests.scenes import camera, cloud, splats, textbook_alpha

@@ -6,11 +6,11 @@ import numpy as np
 import torch
 
 from stages.raster.kernels.pool import Pool
-from stages.training.loss import image_loss
+from stages.train.loss import image_loss
 from tests.extremes.measured import Measured, difference, worst
 from tests.scenes import relative
 from tests.tolerances import SSIM
-from tests.training.float64_loss import reference
+from tests.train.float64_loss import reference
 
 
 def ssim(backend):

@@ -6,7 +6,7 @@ import numpy as np
 
 from stages.raster.definition import OPACITY, SH_REST, Backward, gradient_columns, used_columns
 from stages.raster.kernels.pool import Pool
-from stages.training.optimiser import OPACITY_STEPS, LearningRates, apply_gradients, new_model
+from stages.train.optimiser import OPACITY_STEPS, LearningRates, apply_gradients, new_model
 from tests.extremes.measured import Measured, broken, worst
 from tests.tolerances import FIRST_STEP
 

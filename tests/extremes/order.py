@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from stages import train
 from stages.base.stage import Report
 from stages.raster.cpu.rasteriser import CpuRasteriser
 from stages.raster.definition import RasterSettings, splat_arrays
 from stages.raster.draw import render
 from stages.raster.kernels.pool import Pool
-from stages.training import build
-from stages.training.cpu_step import CpuStep
+from stages.train import build
+from stages.train import stage as train
+from stages.train.steps.cpu import CpuStep
 from tests.extremes.measured import Measured, difference, worst
 from tests.scenes import PARAMETERS, camera, cloud, gradients, relative
 from tests.small_scene import small_scene

@@ -9,17 +9,18 @@ from pathlib import Path
 
 import numpy as np
 
-from stages import formats, seed
+from stages import formats
 from stages.base.stage import Report
 from stages.formats import usd_read
 from stages.raster.definition import RasterSettings
 from stages.raster.draw import render
 from stages.scene import Camera, Reconstruction, Splats, View, look_at, scene_extent
-from stages.structure.levelling import level_and_recentre
+from stages.seed import stage as seed
+from stages.sfm.place.levelling import level_and_recentre
 from tests.extremes.measured import Measured, difference, worst
 from tests.extremes.oracles import centre_in_picture, means2d
 from tests.scenes import PARAMETERS, camera, cloud, join, splats
-from tests.structure.synthetic import orbit_model, random_rotation
+from tests.sfm.synthetic import orbit_model, random_rotation
 from tests.tolerances import FAR_FROM_ORIGIN_PX, FLOAT32_SHIFT, ROBUST_EXTENT
 
 # 1e6 and 6.4e6 m in some direction; float32 holds none of these numbers

@@ -98,10 +98,10 @@ def prepare() -> None:
     """Load what all processes need; the process has no threads afterwards."""
     import torch
 
-    import stages.training.hooks
+    import stages.train.hooks
     from splatcli.app import app
 
-    stages.training.hooks.CHECKPOINT_SECONDS = CHECKPOINT_SECONDS
+    stages.train.hooks.CHECKPOINT_SECONDS = CHECKPOINT_SECONDS
     torch.set_num_threads(1)
     with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
         app(["train", "--help"])

@@ -17,9 +17,9 @@ import pytest
 from stages import formats
 from stages.base.errors import Family, SplatError
 from stages.editing import levels
+from stages.evaluate.image_metrics import capped_psnr_db
 from stages.formats import sog, streamed_sog
 from stages.formats.values import drawable_rows
-from stages.measure.image_metrics import capped_psnr_db
 from stages.proof.checks import read_back
 from stages.raster.draw import raster_settings_of, renderer
 from stages.scene import Camera, Splats, look_at

@@ -13,8 +13,8 @@ import pytest
 from stages import formats
 from stages.base.errors import Family, SplatError
 from stages.formats import BY_ENDING, FORMATS, Format
+from stages.formats.mesh_table import MESHES, MeshFormat
 from stages.proof.checks import CHECKS, byte_breakdown_of
-from stages.surface.table import MESHES, MeshFormat
 from tests.formats.files import read
 from tests.formats.truth import many_splats
 

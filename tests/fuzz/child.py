@@ -20,7 +20,7 @@ from pathlib import Path
 from random import Random
 
 from stages.base.errors import SplatError
-from stages.photos.decode import Unusable
+from stages.ingest.decode import Unusable
 from tests.fuzz.arcs import Arcs
 from tests.fuzz.changes import damaged
 from tests.fuzz.cost import (

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageCms
 
-from stages.photos.decode import Decoded, PixelBudget, decode, readers_set_up
-from stages.photos.exif import Exif
-from stages.photos.masking import AUTO, MaskedPhoto
+from stages.ingest.decode import Decoded, PixelBudget, decode, readers_set_up
+from stages.ingest.exif import Exif
+from stages.ingest.masking import AUTO, MaskedPhoto
 from tests.fuzz.layer import Layer
-from tests.photos.made_files import exif, textured
+from tests.ingest.made_files import exif, textured
 
 WIDTH, HEIGHT = 48, 32
 _MAX_SIDE = 1600

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from stages.base.errors import Family, SplatError
-from stages.photos.capture_file import FILE, load_capture, save_capture
+from stages.ingest.capture_file import FILE, load_capture, save_capture
 from stages.run.manifest import MANIFEST, Manifest, write_sealed
 from stages.run.runfile import RUN_FILE, RunFile
 from stages.scene import Capture, Photo, load_splats, save_splats
 from stages.scene.storage import FILE_NAME
-from stages.training import checkpoint
-from stages.training.optimiser import new_model
+from stages.train import checkpoint
+from stages.train.optimiser import new_model
 from tests.formats.truth import many_splats
 from tests.fuzz.layer import SPLATS, Layer
 

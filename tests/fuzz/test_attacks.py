@@ -24,8 +24,8 @@ from stages.cameras import nerfstudio, realityscan
 from stages.cameras.camera_file import size_of_picture
 from stages.formats import streamed_sog
 from stages.formats.spz_read import MAGIC
-from stages.photos.decode import PixelBudget, Unusable, decode, jpeg_fault, readers_set_up
-from stages.photos.exif import Exif
+from stages.ingest.decode import PixelBudget, Unusable, decode, jpeg_fault, readers_set_up
+from stages.ingest.exif import Exif
 from stages.run.manifest import MANIFEST, Manifest, write_sealed
 from stages.run.runfile import RUN_FILE, RunFile
 from stages.scene import load_splats, save_splats

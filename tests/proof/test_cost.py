@@ -5,7 +5,7 @@ import pytest
 
 from stages.proof.statistics import DEGREES, floats_of, mass_within, memory_of
 from stages.raster.definition import splat_arrays, used_columns
-from stages.training.optimiser import new_model
+from stages.train.optimiser import new_model
 from tests.scenes import cloud
 
 

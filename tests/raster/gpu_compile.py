@@ -19,7 +19,7 @@ from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
 from stages.raster.gpu import blend, gradients, lists, project
-from stages.training import gpu_kernels
+from stages.train.steps import gpu_kernels
 
 FLOATS, DOUBLES, INTS, LONGS, BYTES, SHORTS = "*fp32", "*fp64", "*i32", "*i64", "*i8", "*i16"
 POINTERS = {

@@ -42,8 +42,8 @@ def test_a_backend_that_returns_zeros_is_found_out(monkeypatch: pytest.MonkeyPat
 
 
 def test_a_backend_takes_part_in_training_without_a_step_of_its_own(monkeypatch) -> None:
-    from stages.training.reference_step import ReferenceStep
-    from stages.training.step import step_of
+    from stages.train.steps.reference import ReferenceStep
+    from stages.train.steps.step import step_of
 
     fake = Backend("another", "stages.raster.reference_rasteriser:ReferenceRasteriser", "a test")
     monkeypatch.setattr(backends, "BACKENDS", (*backends.BACKENDS, fake))

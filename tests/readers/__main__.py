@@ -16,13 +16,15 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from stages import formats, quantise, sfm
+from stages import formats
+from stages.evaluate.image_metrics import psnr
 from stages.formats.values import drop_undrawable
-from stages.measure.image_metrics import psnr
 from stages.proof.checks import read_back
 from stages.proof.compare import differences
+from stages.quantise import stage as quantise
 from stages.raster.draw import render
 from stages.scene import Camera, Splats, View, look_at, split_held_out
+from stages.sfm import stage as sfm
 from tests.packages import UnavailableError, installed
 from tests.readers.engines import (
     ENGINES,

@@ -10,8 +10,8 @@ import pytest
 
 from stages import formats
 from stages.editing import levels
+from stages.evaluate.image_metrics import psnr
 from stages.formats.values import sh_degrees_used
-from stages.measure.image_metrics import psnr
 from stages.raster.draw import render
 from stages.scene import Splats
 from tests.readers.engines import (

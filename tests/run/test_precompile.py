@@ -121,7 +121,7 @@ def test_a_python_that_cannot_be_started_stops_nothing(
 @pytest.mark.timeout(300)
 def test_training_finds_all_its_kernels_compiled(tmp_path: Path) -> None:
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kernels")}
-    warm = processes.module("stages.training.compile_kernels", "cpu")
+    warm = processes.module("stages.train.compile_kernels", "cpu")
     with processes.running(warm, env=environment, stdin=subprocess.PIPE) as process:
         assert process.wait(200) == 0
     script = processes.python(MISSING, str(tmp_path))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stages.measure.image_metrics import psnr
+from stages.evaluate.image_metrics import psnr
 from stages.raster.draw import raster_settings_of, render
 from stages.scene import Camera, Splats, look_at
 from stages.scene.draw_settings import near_plane_of

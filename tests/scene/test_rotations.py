@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stages.scene.rotations import matrices_of, quaternions_of
-from tests.structure.synthetic import random_rotation
+from tests.sfm.synthetic import random_rotation
 
 
 @given(st.integers(0, 1000))

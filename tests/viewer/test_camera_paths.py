@@ -16,7 +16,7 @@ from stages.viewer.camera_paths import (
     tour,
 )
 from tests import scenes
-from tests.structure.synthetic import random_rotation
+from tests.sfm.synthetic import random_rotation
 
 SPLATS = scenes.cloud(30)
 

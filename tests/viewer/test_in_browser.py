@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 
 from stages import formats
+from stages.evaluate.image_metrics import psnr
 from stages.formats import ply
-from stages.measure.image_metrics import psnr
 from stages.viewer.server import LocalServer
 from stages.viewer.site import site
 from tests.viewer.browser import Browser

@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stages.formats.page.cameras import page_cameras
-from stages.measure.image_metrics import psnr
+from stages.evaluate.image_metrics import psnr
+from stages.page.cameras import page_cameras
 from stages.raster.draw import render
 from stages.run.pipeline import Pipeline
 from stages.scene import Camera, Splats

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stages.formats.page.cameras import PageCamera, page_cameras
+from stages.page.cameras import PageCamera, page_cameras
 from stages.scene import Camera
 from stages.viewer.live_page import SIDES, LivePage
 from stages.viewer.server import LocalServer

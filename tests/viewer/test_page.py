@@ -12,8 +12,8 @@ import pytest
 
 from stages import formats
 from stages.formats import html
-from stages.formats.page import document
-from stages.formats.page.cameras import PageCamera, as_plain, page_cameras
+from stages.page import document
+from stages.page.cameras import PageCamera, as_plain, page_cameras
 from stages.proof.checks import read_back
 from stages.scene import Camera, Splats, look_at
 from stages.viewer.site import site

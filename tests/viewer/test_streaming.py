@@ -14,8 +14,8 @@ import pytest
 from stages import formats
 from stages.base.errors import SplatError
 from stages.editing import levels
+from stages.evaluate.image_metrics import psnr
 from stages.formats import streamed_sog
-from stages.measure.image_metrics import psnr
 from stages.raster.draw import render
 from stages.scene import Camera, View, look_at
 from stages.viewer.server import Item, LocalServer

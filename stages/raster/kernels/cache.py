@@ -19,7 +19,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 KEPT = 3  # folders of compiled kernels, the one in use included
-PACKAGES = ("raster", "structure", "surface", "training")  # those with kernels
+PACKAGES = ("mesh", "raster", "sfm", "train")  # those with kernels
 _VARIABLE = "NUMBA_CACHE_DIR"
 UNUSED_S = 24 * 3600.0  # since a process began to use a folder, before it may be removed
 

@@ -101,7 +101,7 @@ def test_kernels_of_a_folder_that_is_removed_are_compiled_again(tmp_path: Path) 
     code = (
         "import shutil; from stages.raster.kernels import cache\n"
         "shutil.rmtree(cache.folder())\n"
-        "from stages.surface.fuse_kernels import _clip\n"
+        "from stages.mesh.fuse_kernels import _clip\n"
         "print(_clip(0.0, 1.0, 0.5, 0.0), cache.are_compiled('_clip'))"
     )
     assert python(code, tmp_path) == "(0.0, 1.0) True"

@@ -1,0 +1,86 @@
+"""The Python API: process a folder of photographs, and draw the splats. docs/guide/python.md shows
+its use; `splat process` does the same with a progress bar."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from stages import STAGE_NAMES, load_stage
+from stages.base.settings import changed
+from stages.raster.backends import backend_of_settings
+from stages.run.pipeline import Listener, Pipeline
+from stages.run.results import reconstruction_of
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from stages.scene import Camera, ExportedAssets, Reconstruction, Splats
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The results of a finished run.
+
+    reconstruction: posed views and sparse points. splats: the last ones, as they were exported.
+    assets: the files that were written. metrics: figures by stage, as its manifest has them.
+    backend: draws them.
+    """
+
+    run_folder: Path
+    reconstruction: Reconstruction
+    splats: Splats
+    assets: ExportedAssets
+    metrics: Mapping[str, Mapping[str, Any]]
+    backend: str
+
+    def draw(self, camera: Camera) -> NDArray[np.uint8]:
+        """sRGB picture [H, W, 3] from a camera in the world of `reconstruction`."""
+        from stages.raster.draw import render
+        from stages.viewer.sinks import eight_bits
+
+        return eight_bits(render(self.splats, camera, backend=self.backend).image)
+
+
+def process(
+    photos: Path,
+    run_folder: Path,
+    preset: str = "standard",
+    listener: Listener | None = None,
+    **options: Any,
+) -> Scene:
+    """Run all stages that are not finished, and load what they made.
+
+    Args:
+        photos: folder of photographs, or a video.
+        run_folder: made if missing; continued if it is a run of the same photographs.
+        preset: "preview", "standard" or "best".
+        listener: receives progress, if given.
+        options: fields of the stages' settings; a field that several stages have is set in all.
+
+    Raises SplatError as `splat process` reports it, TypeError for an unknown option, ValueError
+    for an unknown preset.
+    """
+    from stages.train.stage import PRESETS
+
+    if preset not in PRESETS:
+        raise ValueError(f"preset {preset!r}: one of {', '.join(PRESETS)} is wanted")
+    settings: dict[str, Any] = {name: load_stage(name).settings_type() for name in STAGE_NAMES}
+    settings["train"] = PRESETS[preset]
+    known = {field.name for found in settings.values() for field in fields(found)}
+    if unknown := options.keys() - known:
+        raise TypeError(f"no stage has the option {', '.join(sorted(unknown))}")
+    settings = {name: changed(found, options) for name, found in settings.items()}
+    pipeline = Pipeline(run_folder, photos)
+    manifests = pipeline.run(settings, listener=listener)
+    return Scene(
+        run_folder=Path(run_folder),
+        reconstruction=reconstruction_of(pipeline),
+        splats=pipeline.load("quantise").splats,
+        assets=pipeline.load("export"),
+        metrics={manifest.stage: manifest.metrics for manifest in manifests},
+        backend=backend_of_settings(settings["train"]),
+    )

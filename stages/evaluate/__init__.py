@@ -1,0 +1,1 @@
+"""The one evaluation (PSNR, SSIM, FLIP), the contribution of each splat, floaters, coverage."""

@@ -1,0 +1,276 @@
+"""The contribution of each splat, and of each SH degree of its colour, to a set of views.
+
+The rasteriser sums, for every splat and view, what the picture and its squared error would change
+by if that splat alone were removed (see `raster.definition`). Here these sums are added over views.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from stages.evaluate.evaluation import EvaluationView, image_renderer
+from stages.evaluate.image_metrics import capped_psnr_db
+from stages.raster.backends import rasteriser_of
+from stages.raster.definition import (
+    ERROR_CHANGE,
+    LARGEST_WEIGHT,
+    PICTURE_CHANGE,
+    SQUARED_WEIGHT,
+    WEIGHT,
+    WEIGHTED_RESIDUAL,
+    Forward,
+    Rasteriser,
+    splat_arrays,
+)
+from stages.raster.draw import raster_settings_of
+from stages.raster.reference import sh_basis
+from stages.scene import IGNORE, Camera, Splats
+
+VISIBLE_WEIGHT = 1.0 / 255.0  # a smaller blend weight cannot change an 8-bit picture
+MAX_MEASURED_VIEWS = 48  # in a round of removal; enough to say which splats contribute least
+MARGIN = 0.25  # of the longer side: as far as seeding continues a picture beyond its edge
+
+
+@dataclass(frozen=True)
+class Contributions:
+    """What N splats contribute to V views.
+
+    Squared errors are sums over pixels and channels. L is the SH degree of the splats.
+
+    Args:
+        sse_change: [N] change of the summed squared error if this splat alone were removed;
+            negative where the views would be matched better without it.
+        picture_change: [N] summed squared change of the pictures then, whatever the views show.
+        weight: [N] summed blend weight.
+        kept_weight: [N] that over the pixels that no mask ignores.
+        view_counts: [N] views in which a pixel has a blend weight of 1/255 or more.
+        sse: summed squared error of the pictures as they are.
+        scene_depth: [V] median depth of each picture, world units; inf where nothing is drawn.
+        truncated_sse_change: [N, L] as `sse_change`, if the colour kept only the SH coefficients up
+            to degree 0..L - 1 and the mean of what is lost were added to its DC.
+        truncated_picture_change: [N, L] as `picture_change`, for the same truncation.
+        truncated_colour: [N, L, 3] that mean: what is added to the colour.
+        psnr_db: [V] PSNR of each picture.
+        sh_sums: the sums that the truncated figures come from, so that more views can be added.
+        previous: the contributions that this measurement started from. They are included in all
+            fields but `psnr_db`.
+    """
+
+    sse_change: NDArray[np.float64]
+    picture_change: NDArray[np.float64]
+    weight: NDArray[np.float64]
+    kept_weight: NDArray[np.float64]
+    view_counts: NDArray[np.int32]
+    sse: float
+    scene_depth: NDArray[np.float64]
+    truncated_sse_change: NDArray[np.float64]
+    truncated_picture_change: NDArray[np.float64]
+    truncated_colour: NDArray[np.float64]
+    psnr_db: NDArray[np.float64]
+    sh_sums: tuple[NDArray[np.float64], ...] = ()
+    previous: Contributions | None = None
+
+    def take(self, rows: NDArray[np.bool_]) -> Contributions:
+        """The contributions of these splats only, as a start of a further measurement. The
+        truncated figures are not reduced."""
+        return replace(
+            self,
+            sse_change=self.sse_change[rows],
+            picture_change=self.picture_change[rows],
+            weight=self.weight[rows],
+            kept_weight=self.kept_weight[rows],
+            view_counts=self.view_counts[rows],
+            sh_sums=tuple(sums[rows] for sums in self.sh_sums),
+        )
+
+
+def measure_contributions(
+    splats: Splats,
+    views: Iterable[EvaluationView],
+    backend: str,
+    previous: Contributions | None = None,
+    truncation: bool = True,
+    beyond: float = 0.0,
+) -> Contributions:
+    """The contribution of each splat to the views.
+
+    Args:
+        splats: drawn by their own settings.
+        views: to compare with.
+        backend: the rasteriser's name.
+        previous: contributions of the same splats to further views. They may have been measured
+            before the splats around them changed a little. The result includes them.
+        truncation: whether to measure the truncated figures; else these are [N, 0].
+        beyond: how far each picture is continued on all sides, in longer sides of the picture. What
+            is drawn there counts as if it were right; `sse` and `psnr_db` are of the picture alone.
+    """
+    n = len(splats)
+    change, picture, weight, kept_weight = np.zeros((4, n))
+    view_counts, sse, depths, psnr_db = np.zeros(n, np.int32), 0.0, [], []
+    if previous is not None:
+        change, picture = previous.sse_change.copy(), previous.picture_change.copy()
+        weight, view_counts = previous.weight.copy(), previous.view_counts.copy()
+        kept_weight = previous.kept_weight.copy()
+        sse, depths = previous.sse, previous.scene_depth.tolist()
+    rasteriser, arrays = rasteriser_of(backend), splat_arrays(splats)
+    settings = raster_settings_of(splats)
+    sh = _ShTruncation(splats, truncation, previous.sh_sums if previous else ())
+    for view in views:
+        border = round(beyond * max(view.camera.width, view.camera.height))
+        forward = rasteriser.forward(arrays, view.camera.continued(border), settings, depths=True)
+        drawn = _inside(forward.image[:3], border).transpose(1, 2, 0)
+        psnr_db.append(capped_psnr_db(drawn, view.image, view.valid))
+        residual = np.zeros_like(forward.image[:3])
+        _inside(residual, border)[:] = (drawn - view.image).transpose(2, 0, 1)
+        if view.valid is not None:
+            _inside(residual, border)[:] *= view.valid
+        sse += float(np.sum(residual.astype(np.float64) ** 2))
+        solid = forward.image[4][forward.image[3] > 0.5]
+        depths.append(float(np.median(solid)) if solid.size else np.inf)
+        found = rasteriser.contributions(forward, residual)
+        rows = forward.visible
+        change[rows] += found[:, ERROR_CHANGE]
+        picture[rows] += found[:, PICTURE_CHANGE]
+        weight[rows] += found[:, WEIGHT]
+        kept_weight[rows] += _kept_weight(rasteriser, forward, view, border, found)
+        view_counts[rows] += found[:, LARGEST_WEIGHT] >= VISIBLE_WEIGHT
+        sh.add(view.camera.centre, rows, found)
+    truncated_sse_change, truncated_picture_change, truncated_colour = sh.figures()
+    return Contributions(
+        sse_change=change,
+        picture_change=picture,
+        weight=weight,
+        kept_weight=kept_weight,
+        view_counts=view_counts,
+        sse=sse,
+        scene_depth=np.array(depths),
+        truncated_sse_change=truncated_sse_change,
+        truncated_picture_change=truncated_picture_change,
+        truncated_colour=truncated_colour,
+        psnr_db=np.array(psnr_db),
+        sh_sums=sh.sums,
+        previous=previous,
+    )
+
+
+def _inside(image: NDArray[np.float32], border: int) -> NDArray[np.float32]:
+    """A view of `image` [C, H, W] without its border."""
+    _, height, width = image.shape
+    return image[:, border : height - border, border : width - border]
+
+
+def _kept_weight(
+    rasteriser: Rasteriser,
+    forward: Forward,
+    view: EvaluationView,
+    border: int,
+    found: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """[K] summed blend weight over the pixels that the view's mask does not ignore. border: how
+    many pixels the picture is continued by. found: [K, ...] the rasteriser's contributions."""
+    if view.mask is None or view.outside != IGNORE:
+        return found[:, WEIGHT]
+    kept = np.pad((view.mask > 0).astype(np.float32), border, constant_values=1.0)
+    kept = np.repeat(kept[None], 3, axis=0)
+    return rasteriser.contributions(forward, kept)[:, WEIGHTED_RESIDUAL]
+
+
+class _ShTruncation:
+    """Sums over views for each SH degree that colours may be truncated to.
+
+    d is the change of a splat's colour in a view, g the gradient of half the squared error with
+    respect to that colour, q the splat's summed squared blend weights.
+    """
+
+    def __init__(
+        self, splats: Splats, wanted: bool, start: tuple[NDArray[np.float64], ...]
+    ) -> None:
+        self.splats, self.degrees = splats, splats.sh_degree if wanted else 0
+        shape = (len(splats), self.degrees, 3)
+        if start:
+            self.sums = tuple(sums.copy() for sums in start)
+        else:
+            shapes = (shape, shape, shape, (len(splats), 1, 3), (len(splats), 1, 1))
+            self.sums = tuple(np.zeros(one) for one in shapes)
+        self.dg, self.ddq, self.dq, self.g, self.q = self.sums
+
+    def add(
+        self, centre: NDArray[np.floating], rows: NDArray[np.int32], found: NDArray[np.float64]
+    ) -> None:
+        """Add one view: its camera centre [3] and the rasteriser's contributions [K, ...] of the
+        splats `rows` [K]."""
+        if not self.degrees:
+            return
+        every = colours_by_degree(self.splats.take(rows), centre)
+        d = every[:, :-1] - every[:, -1:]
+        g, q = found[:, None, WEIGHTED_RESIDUAL:], found[:, SQUARED_WEIGHT, None, None]
+        self.dg[rows] += d * g
+        self.ddq[rows] += d * d * q
+        self.dq[rows] += d * q
+        self.g[rows] += g
+        self.q[rows] += q
+
+    def figures(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """The truncated figures of `Contributions`.
+
+        With s added to the colour, the squared error of each view changes by
+        2 (d + s) g + (d + s)^2 q. The s that is used makes the mean of d + s, weighted by q, zero.
+        """
+        with np.errstate(invalid="ignore", divide="ignore"):
+            s = np.where(self.q > 0, -self.dq / self.q, 0.0)
+        by_residual = 2 * (self.dg + s * self.g)
+        of_picture = self.ddq + 2 * s * self.dq + s * s * self.q
+        return (by_residual + of_picture).sum(2), of_picture.sum(2), s
+
+
+def blend_weights(
+    splats: Splats, cameras: Iterable[Camera], backend: str
+) -> Iterator[tuple[NDArray[np.int32], NDArray[np.float64]]]:
+    """For each camera: the rows [K] of the splats that it shows, and the sum of each one's blend
+    weights over the picture [K], pixels."""
+    rasteriser, arrays = rasteriser_of(backend), splat_arrays(splats)
+    settings = raster_settings_of(splats)
+    for camera in cameras:
+        forward = rasteriser.forward(arrays, camera, settings)
+        no_residual = np.zeros((3, camera.height, camera.width), np.float32)
+        yield forward.visible, rasteriser.contributions(forward, no_residual)[:, WEIGHT]
+
+
+def colours_by_degree(splats: Splats, centre: NDArray[np.floating]) -> NDArray[np.float64]:
+    """[N, L + 1, 3] colour of each splat seen from `centre` [3], with the SH coefficients up to
+    degree 0..L."""
+    offsets = splats.means - centre
+    with np.errstate(invalid="ignore", divide="ignore"):
+        directions = offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
+    basis = sh_basis(torch.from_numpy(directions), splats.sh_degree).numpy()
+    terms = basis[:, :, None] * splats.sh
+    ends = np.arange(1, splats.sh_degree + 2) ** 2 - 1
+    return np.maximum(0.5 + np.cumsum(terms, axis=1)[:, ends], 0.0)
+
+
+def squared_error(splats: Splats, views: Iterable[EvaluationView], backend: str) -> float:
+    """Summed over pixels and channels of all views, as `Contributions.sse`."""
+    draw, found = image_renderer(splats, backend), 0.0
+    for view in views:
+        squares = np.square(draw(view.camera) - view.image, dtype=np.float64)
+        found += float(squares.sum() if view.valid is None else squares[view.valid].sum())
+    return found
+
+
+def near_view_frusta(
+    splats: Splats, cameras: Iterable[Camera], margin: float = MARGIN
+) -> NDArray[np.bool_]:
+    """[N] splats that project into a picture or just beyond its edge, where new views look: by at
+    most `margin` of its longer side."""
+    near = np.zeros(len(splats), bool)
+    for camera in cameras:
+        pixels, z = camera.project(splats.means)
+        size = np.array([camera.width, camera.height])
+        beyond = margin * size.max()
+        near |= (z > 0) & ((pixels > -beyond) & (pixels < size + beyond)).all(1)
+    return near

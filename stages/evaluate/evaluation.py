@@ -1,0 +1,335 @@
+"""The one evaluation: views with their photographs, and how near drawings of splats are to them.
+
+Every figure of quality in a run comes from here: the same photographs in 8 bits, at the size that
+the splats were trained at, drawn by the run's backend with the near plane of the capture.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from threading import Event
+from typing import overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.base.errors import Interrupted
+from stages.evaluate.image_metrics import capped_psnr_db, flip, ssim
+from stages.raster.draw import renderer
+from stages.scene import IGNORE, TRANSPARENT, Camera, DrawSettings, Splats, View
+from stages.scene.light import BRIGHT, OFFSET, Light, gains_and_offsets, vignetting_gains
+from stages.scene.pictures import load_image, mask_of, scaled_image, scaled_mask
+
+IN_MEMORY_MIB = 512  # of photographs; further ones are read from disk each time
+LARGEST_SUBSET = 24  # held-out views for what is too slow, or takes too much room, for all
+SIZES = {"full": 1.0, "half": 0.5, "quarter": 0.25}  # of the pictures, by name; each side's scale
+_TIMED_RUNS = 3
+ImageRenderer = Callable[[Camera], NDArray[np.floating]]  # a picture [H, W, 3]
+
+
+@dataclass(frozen=True)
+class EvaluationView:
+    """A view with its photograph, at the size of the comparison.
+
+    Args:
+        name: of the photograph.
+        camera: at this size.
+        pixels: [H, W, 3] uint8, sRGB.
+        mask: [H, W], as in `scene.Photo`; None where all pixels count.
+        outside: what is outside the mask, as in `scene.Photo`.
+        saturated: [H, W] pixels with a channel too bright to be measured, which are not compared;
+            None where there are none.
+    """
+
+    name: str
+    camera: Camera
+    pixels: NDArray[np.uint8]
+    mask: NDArray[np.uint8] | None = None
+    outside: str = ""
+    saturated: NDArray[np.bool_] | None = None
+
+    @property
+    def image(self) -> NDArray[np.float32]:
+        """[H, W, 3] in [0, 1]."""
+        return self.pixels * np.float32(1 / 255)
+
+    @property
+    def valid(self) -> NDArray[np.bool_] | None:
+        """[H, W] the pixels that are compared, or None for all."""
+        valid = self.mask > 0 if self.mask is not None and self.outside == IGNORE else None
+        if self.saturated is None:
+            return valid
+        return ~self.saturated if valid is None else valid & ~self.saturated
+
+    def in_median_light(self, light: Light | None) -> EvaluationView:
+        """With the exposure and white balance of the median photograph; see `scene.light`."""
+        if light is None:
+            return self
+        gains, offsets = gains_and_offsets(light)
+        alpha = self.mask if self.outside == TRANSPARENT else None
+        solid = np.float32(1) if alpha is None else alpha[..., None] * np.float32(1 / 255)
+        even = (self.image - offsets * solid) / gains
+        pixels = np.rint(even * 255).clip(0, 255).astype(np.uint8)
+        return replace(self, pixels=pixels, saturated=np.asarray((self.image >= BRIGHT).any(2)))
+
+    def scaled(self, scale: float) -> EvaluationView:
+        """At `scale` (at most 1) times the size along each side, by area averaging as in
+        `scene.pictures`. A pixel is compared if all that it averages is."""
+        if scale == 1:
+            return self
+        camera = self.camera.resized(
+            *(max(1, round(scale * side)) for side in (self.camera.width, self.camera.height))
+        )
+        size = camera.width, camera.height
+        mask, saturated = self.mask, self.saturated
+        if mask is not None:
+            mask = scaled_mask(mask, *size, self.outside)
+        if saturated is not None:
+            saturated = scaled_image(saturated.astype(np.float32), *size) > 0
+        pixels = np.rint(scaled_image(self.image, *size) * 255).astype(np.uint8)
+        return replace(self, camera=camera, pixels=pixels, mask=mask, saturated=saturated)
+
+    def over(self, grey: float) -> EvaluationView:
+        """Composited over `grey` (0 to 1) instead of black, where it has transparency."""
+        if self.mask is None or self.outside != TRANSPARENT:
+            return self
+        behind = (255 - self.mask[..., None]) * np.float32(grey)
+        return replace(self, pixels=np.rint(self.pixels + behind).clip(0, 255).astype(np.uint8))
+
+
+@dataclass(frozen=True)
+class Score:
+    """How near one drawing is to its photograph, by the definitions in `image_metrics`. psnr_db: at
+    most `IDENTICAL_DB`. flip: None where it was not computed."""
+
+    name: str
+    psnr_db: float
+    ssim: float
+    flip: float | None = None
+
+
+class _EvaluationViews(Sequence[EvaluationView]):
+    """The first views in memory, the others on disk."""
+
+    def __init__(
+        self, folder: Path, views: Iterable[View], draw_settings: DrawSettings, stop: Event | None
+    ) -> None:
+        self._folder, self._views, self._draw_settings = folder, tuple(views), draw_settings
+        self._stop = stop
+        self._loaded: list[EvaluationView] = []
+        free = IN_MEMORY_MIB * 2**20
+        for number, view in enumerate(self._views):
+            camera = draw_settings.camera(view.camera)
+            free -= 4 * camera.width * camera.height  # three colours and perhaps a mask
+            if free < 0:
+                break
+            self._loaded.append(self._load(number))
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    @overload
+    def __getitem__(self, number: int) -> EvaluationView: ...
+    @overload
+    def __getitem__(self, number: slice) -> Sequence[EvaluationView]: ...
+    def __getitem__(self, number: int | slice) -> EvaluationView | Sequence[EvaluationView]:
+        if isinstance(number, slice):
+            return [self[i] for i in range(len(self))[number]]
+        number = range(len(self))[number]
+        self._stop_if_requested()
+        return self._loaded[number] if number < len(self._loaded) else self._load(number)
+
+    def _stop_if_requested(self) -> None:
+        if self._stop is not None and self._stop.is_set():
+            raise Interrupted("stopped before a view")
+
+    def _load(self, number: int) -> EvaluationView:
+        self._stop_if_requested()
+        view, draw_settings = self._views[number], self._draw_settings
+        camera = draw_settings.camera(view.camera)
+        found = load_evaluation_view(self._folder, view, camera, draw_settings.vignetting)
+        return found.in_median_light(view.light if draw_settings.light else None).over(
+            draw_settings.background
+        )
+
+
+def load_evaluation_views(
+    folder: Path, views: Iterable[View], draw_settings: DrawSettings, stop: Event | None = None
+) -> Sequence[EvaluationView]:
+    """The views with their photographs at the size of `look`, over its background and in its light.
+
+    As many as fit into `IN_MEMORY_MIB` are read at once. Raises SplatError, now or when a view is
+    used, and Interrupted when `stop` is set.
+    """
+    return _EvaluationViews(folder, views, draw_settings, stop)
+
+
+def load_evaluation_view(
+    folder: Path, view: View, camera: Camera, vignetting: bool = False
+) -> EvaluationView:
+    """The view's picture in `folder` on the camera's pixel grid, over black where it is
+    transparent. vignetting: whether it is corrected. Raises SplatError."""
+    picture = load_image(folder / view.image, camera.width, camera.height)
+    mask = mask_of(folder, view, camera.width, camera.height)
+    if vignetting and view.vignetting:
+        black = np.full((*picture.shape[:2], 1), OFFSET, np.float32)
+        if mask is not None and view.outside == TRANSPARENT:
+            black *= mask[..., None] * np.float32(1 / 255)
+        gains = vignetting_gains(view.vignetting, camera)[..., None]
+        largest = np.where(picture < BRIGHT, BRIGHT - 1 / 255, 1)  # what was measured stays so
+        picture = ((picture + black) / gains - black).clip(0, largest)
+    pixels = np.round(picture * 255).astype(np.uint8)
+    if mask is not None and view.outside == TRANSPARENT:
+        pixels[mask == 0] = 0  # where JPEG left traces of an edge
+    return EvaluationView(view.name, camera, pixels, mask, view.outside)
+
+
+def evaluation_subset(count: int) -> range:
+    """Indices of at most `LARGEST_SUBSET` of `count` views, evenly spaced."""
+    return range(0, count, max(1, -(-count // LARGEST_SUBSET)))
+
+
+def evaluate(
+    draw: ImageRenderer, views: Sequence[EvaluationView], with_flip: bool = False
+) -> list[Score]:
+    """Compare drawings, clipped to [0, 1], with the views' photographs.
+
+    Args:
+        draw: draws a camera's picture.
+        views: to compare with.
+        with_flip: also compute FLIP, which takes five times as long as PSNR and SSIM, for the
+            `evaluation_subset` of the views.
+    """
+    return evaluate_at_sizes(draw, views, {"full": 1.0}, with_flip)["full"]
+
+
+def evaluate_at_sizes(
+    draw: ImageRenderer,
+    views: Sequence[EvaluationView],
+    sizes: Mapping[str, float] = SIZES,
+    with_flip: bool = False,
+) -> dict[str, list[Score]]:
+    """`evaluate` the views at several sizes: a viewer does not draw at the size of training.
+
+    Args:
+        draw: draws a camera's picture, at the camera's size.
+        views: at the full size; smaller photographs are area averages, see `EvaluationView.scaled`.
+        sizes: the scale of each side, at most 1, by name.
+        with_flip: as in `evaluate`.
+
+    Returns:
+        The scores of the views by the name of the size.
+    """
+    scores: dict[str, list[Score]] = {name: [] for name in sizes}
+    with_flip_too = evaluation_subset(len(views)) if with_flip else ()
+    for number, full in enumerate(views):
+        for name, scale in sizes.items():
+            view = full.scaled(scale)
+            image, truth = np.clip(draw(view.camera), 0.0, 1.0), view.image
+            valid = view.valid
+            error = flip(image, truth, valid) if number in with_flip_too else None
+            psnr_db, similarity = capped_psnr_db(image, truth, valid), ssim(image, truth, valid)
+            scores[name].append(Score(view.name, psnr_db, similarity, error))
+    return scores
+
+
+def psnr_as_taken_db(
+    draw: ImageRenderer, folder: Path, views: Iterable[View], draw_settings: DrawSettings
+) -> tuple[float, float]:
+    """Mean PSNR against photographs in the light that they were taken in, in two ways.
+
+    Returns:
+        The mean PSNR of the drawings as they are, and that of their right halves after an affine
+        map of each channel that was fitted to the left halves.
+    """
+    plain, adapted = [], []
+    as_taken = replace(draw_settings, light=False, vignetting=False)
+    for view in load_evaluation_views(folder, views, as_taken):
+        image, truth = np.clip(draw(view.camera), 0.0, 1.0), view.image
+        half, everywhere = truth.shape[1] // 2, np.ones(truth.shape[:2], bool)
+        valid = everywhere if view.valid is None else view.valid
+        plain.append(capped_psnr_db(image, truth, valid))
+        left, right = valid.copy(), valid.copy()
+        left[:, half:], right[:, :half] = False, False
+        if left.sum() > 1 and right.any():
+            adapted.append(capped_psnr_db(_affinely_mapped(image, truth, left), truth, right))
+    return float(np.mean(plain)), float(np.mean(adapted)) if adapted else 0.0
+
+
+def _affinely_mapped(
+    image: NDArray[np.floating], truth: NDArray[np.floating], where: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """`image` under the affine map of each channel that brings it nearest to `truth` at `where`."""
+    found = np.array(image, np.float64)
+    for channel in range(3):
+        known = np.stack([found[where][:, channel], np.ones(int(where.sum()))], axis=1)
+        gain, offset = np.linalg.lstsq(known, truth[where][:, channel], rcond=None)[0]
+        found[..., channel] = gain * found[..., channel] + offset
+    return found
+
+
+def psnr_inside_masks_db(draw: ImageRenderer, views: Iterable[EvaluationView]) -> float | None:
+    """Mean PSNR over the pixels inside the masks of transparent photographs; None if there is
+    none."""
+    found = [
+        capped_psnr_db(draw(view.camera), view.image, view.mask > 0)
+        for view in views
+        if view.mask is not None and view.outside == TRANSPARENT
+    ]
+    return float(np.mean(found)) if found else None
+
+
+def image_renderer(splats: Splats, backend: str) -> ImageRenderer:
+    """A function that draws `splats`, by their own settings, for a camera."""
+    draw = renderer(splats, backend=backend)
+    return lambda camera: draw(camera).image
+
+
+def psnr_of_views_db(
+    splats: Splats, views: Iterable[EvaluationView], backend: str
+) -> NDArray[np.float64]:
+    """[V] PSNR of each view, dB."""
+    draw = image_renderer(splats, backend)
+    return np.array([capped_psnr_db(draw(v.camera), v.image, v.valid) for v in views])
+
+
+def mean_psnr_db(
+    splats: Splats, views: Iterable[EvaluationView], backend: str, scale: float = 1.0
+) -> float:
+    """Mean PSNR over the views, each `EvaluationView.scaled`, dB."""
+    scaled = (view.scaled(scale) for view in views)
+    return float(psnr_of_views_db(splats, scaled, backend).mean())
+
+
+def psnr_name(size: str, stem: str = "psnr") -> str:
+    """The name of a metric at one of `SIZES`: psnr_db, psnr_half_db, psnr_quarter_db."""
+    return f"{stem}_db" if size == "full" else f"{stem}_{size}_db"
+
+
+def seconds_per_frame(
+    splats: Splats,
+    cameras: Sequence[Camera],
+    backend: str,
+    clock: Callable[[], float] = time.perf_counter,
+) -> NDArray[np.float64]:
+    """[V] seconds that each camera's picture takes once kernels and buffers exist: the least of
+    three runs, which other work of the machine disturbs least.
+
+    Args:
+        splats: drawn by their own settings.
+        cameras: V of them.
+        backend: the rasteriser's name.
+        clock: wall-clock time, or `time.process_time` for the CPU time of all threads.
+    """
+    draw = image_renderer(splats, backend)
+    draw(cameras[0])
+    seconds = np.full(len(cameras), np.inf)
+    for _ in range(_TIMED_RUNS):
+        for i, camera in enumerate(cameras):
+            begun = clock()
+            draw(camera)
+            seconds[i] = min(seconds[i], clock() - begun)
+    return seconds

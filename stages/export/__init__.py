@@ -1,0 +1,1 @@
+"""Stage 7: writes the assets, reads each back and compares it."""

@@ -1,0 +1,230 @@
+"""Stage 7: writes files that other programs open, and checks each one.
+
+Every file is read back by a parser that did not write it, drawn from cameras of the capture, and
+compared with the splats that it was made from. A wrong file stops the export. Nothing is trained
+here: `quantise` has fine-tuned the splats to the rounding of the formats.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Any
+
+from stages.base.bad_files import reading, stage_output
+from stages.base.errors import Interrupted, QualityError, SplatError
+from stages.base.settings import setting
+from stages.base.stage import Report, Stage
+from stages.base.text import counted
+from stages.formats.output_formats import (
+    DEFAULT_FORMATS,
+    drawing_setting,
+    formats_setting,
+    mesh_formats,
+)
+from stages.formats.table import FORMATS
+from stages.raster.backends import (
+    backend_of_settings,
+    backend_setting,
+    device_setting,
+    report_backend,
+)
+
+if TYPE_CHECKING:
+    from stages.formats import Format
+    from stages.proof.prover import Prover
+    from stages.scene import (
+        ExportedAssets,
+        ExportedFile,
+        QuantisedSplats,
+        Reconstruction,
+        Splats,
+    )
+
+_INDEX = "assets.json"
+# Every system must take the name, USD's packages too: brackets separate names inside them.
+_NAME = r"(?!assets$)(?![ .])[^/\\:*?\"<>|\[\]\x00-\x1f]{1,100}(?<![ .])"
+
+
+@dataclass(frozen=True)
+class ExportSettings:
+    """Settings of the export."""
+
+    formats: tuple[str, ...] = formats_setting(
+        DEFAULT_FORMATS,
+        "File format to write; repeatable. mesh is a collision proxy, as .glb and .ply",
+        panel="Output",
+    )
+    name: str = setting(
+        "scene",
+        "Name of the files, without a suffix.",
+        pattern=_NAME,
+        wanted="A name that every system takes: letters, digits, spaces, - and _; no "
+        "folder, no suffix.",
+    )
+    backend: str = backend_setting()
+    device: str = device_setting()
+    drawing: str = drawing_setting()
+    mesh_triangles: int = setting(
+        50_000, "Triangles of the mesh, at most about.", min=100, max=100_000_000
+    )
+
+
+def run(
+    inputs: Mapping[str, Any], settings: ExportSettings, folder: Path, report: Report
+) -> ExportedAssets:
+    """Write inputs["quantise"] in all formats into `folder`, seen by the views of inputs["sfm"].
+
+    Metrics: files (how many), splats, dropped; formats: by format size_bytes, bytes_per_splat and
+    the figures of `proof.Proof`, among them verify_db (PSNR between pictures of the splats and of
+    the file, the worst camera) and the largest errors of the values; mesh: the figures of
+    `CollisionMesh`. Raises SplatError "export-verify-failed" (family QUALITY), and what keeps a
+    file from being written.
+    """
+    from stages import formats
+    from stages.formats.sog_quantisation import splats_to_write
+    from stages.formats.values import drop_undrawable
+    from stages.proof.prover import cameras_for, provers_of
+    from stages.scene import ExportedAssets, ExportedFile
+
+    quantised: QuantisedSplats = replace(inputs["quantise"], drawing=settings.drawing)
+    reconstruction: Reconstruction = inputs["sfm"]
+    place = reconstruction.place
+    splats, dropped = drop_undrawable(replace(quantised.splats, place=place))
+    _warn_of_missing(len(splats), dropped, report)
+    chosen = tuple(name for name in dict.fromkeys(settings.formats) if name in FORMATS)
+    cameras = cameras_for(splats, reconstruction.views)
+    prover_of = provers_of(quantised, cameras, backend_of_settings(settings))
+    files, figures = [], {}
+    for number, name in enumerate(chosen):
+        if report.stop_requested.is_set():
+            raise Interrupted("stopped before a file")
+        report.progress(number, len(chosen), f"writing .{name}")
+        path = folder / f"{settings.name}.{name}"
+        held = replace(splats_to_write(FORMATS[name], quantised), place=place)
+        formats.write(path, held, units=reconstruction.units, views=reconstruction.views)
+        _warn_of_losses(FORMATS[name], path, held, report)
+        size = FORMATS[name].size_bytes(path)
+        files.append(ExportedFile(name, path.name, size))
+        figures[name] = {
+            "size_bytes": size,
+            "bytes_per_splat": round(size / max(1, len(splats)), 2),
+            # pictures are compared with all SH coefficients, values with what the file should hold
+            **_prove(prover_of(held), path, report),
+        }
+        report.progress(number + 1, len(chosen), f".{name}", verify_db=figures[name]["verify_db"])
+    for file in _write_meshes(splats, reconstruction, settings, folder, report):
+        files.append(file)
+        figures[file.format] = {"size_bytes": file.size_bytes}
+    report_backend(report, backend_of_settings(settings))
+    report.metric("files", len(files))
+    report.metric("splats", len(splats))
+    report.metric("dropped", dropped)
+    report.metric("formats", figures)
+    _write_index(folder, files)
+    return ExportedAssets(folder, tuple(files))
+
+
+def _write_meshes(
+    splats: Splats,
+    reconstruction: Reconstruction,
+    settings: ExportSettings,
+    folder: Path,
+    report: Report,
+) -> list[ExportedFile]:
+    """Write the requested meshes, and prove each; metric: mesh, see `CollisionMesh`.
+    Raises SplatError "export-verify-failed"."""
+    rows = mesh_formats(settings.formats)
+    if not rows:
+        return []
+    from stages.formats.mesh_files import fault_of
+    from stages.mesh.collision_mesh import make_collision_mesh
+    from stages.scene import ExportedFile
+
+    made = make_collision_mesh(
+        splats, reconstruction, settings.mesh_triangles, backend_of_settings(settings), report
+    )
+    report.metric("mesh", made.figures)
+    files = []
+    for row in rows:
+        path = folder / f"{settings.name}.{row.ending}"
+        resolve_name(row.writer)(path, made.mesh, reconstruction.units)
+        if fault := fault_of(path, row, made.mesh):
+            raise _failed(path, fault, "mesh")
+        files.append(ExportedFile(row.ending, path.name, path.stat().st_size))
+    return files
+
+
+def _warn_of_missing(count: int, dropped: int, report: Report) -> None:
+    if dropped:
+        report.warn(
+            "export-splats-dropped",
+            f"Left out, because of values that no viewer can draw: {counted(dropped, 'splat')}. "
+            "If they are many, train again with another seed.",
+        )
+    if not count:
+        report.warn(
+            "export-empty", "There is not one splat to export; look at the earlier stages' figures."
+        )
+
+
+def _warn_of_losses(row: Format, path: Path, splats: Splats, report: Report) -> None:
+    from stages.formats.losses import losses_of
+
+    for code, text in losses_of(row, path.name, splats).items():
+        report.warn(f"export-{row.ending.replace('.', '-')}-{code}", text)
+
+
+def _write_index(folder: Path, files: list[ExportedFile]) -> None:
+    entries = [asdict(file) for file in files]
+    (folder / _INDEX).write_text(json.dumps(entries, indent=1) + "\n", encoding="utf-8")
+
+
+def _prove(prover: Prover, path: Path, report: Report) -> dict[str, Any]:
+    """The file's figures. Raises SplatError "export-verify-failed"."""
+    from stages.formats import format_of
+
+    row, proof = format_of(path), prover.prove(path)
+    if proof.fault:
+        raise _failed(path, proof.fault, "splats")
+    if proof.loss_db is not None:
+        report.warn(
+            f"export-{row.ending.replace('.', '-')}-lossy",
+            f"{path.name} differs from the trained splats by {proof.loss_db:.1f} dB: the format "
+            f"{row.loses}. Where a viewer reads them, prefer .ply, .glb or .usdz.",
+        )
+    return proof.figures
+
+
+def _failed(path: Path, reason: str, held: str) -> SplatError:
+    return QualityError(
+        "export-verify-failed",
+        given=f"{path.name} came out wrong: {reason}.",
+        wanted=f"A file that another program reads as the same {held}.",
+        hint="Leave this format out with --format, and report this with the run's manifest.",
+    )
+
+
+def load(folder: Path) -> ExportedAssets:
+    """The files of a finished folder. Raises SplatError if its index is damaged."""
+    from stages.scene import ExportedAssets, ExportedFile
+
+    with reading(folder / _INDEX, stage_output("export-folder-damaged")):
+        entries = json.loads((folder / _INDEX).read_text(encoding="utf-8"))
+        files = tuple(
+            ExportedFile(str(e["format"]), str(e["path"]), int(e["size_bytes"])) for e in entries
+        )
+    return ExportedAssets(folder, files)
+
+
+STAGE = Stage(
+    name="export",
+    version=12,
+    reads=("sfm", "quantise"),
+    settings_type=ExportSettings,
+    run=run,
+    load=load,
+)

@@ -1,0 +1,111 @@
+"""Pairs masks with photographs by their names."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path, PurePosixPath
+
+from stages.base.errors import SplatError
+from stages.ingest.sources import Findings, folder_beside, stem_of
+
+FOLDER = "masks"  # beside the photographs' folder, or in it
+MASK_SUFFIXES = frozenset({".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg", ".webp"})
+
+
+def mask_folder(photos: Path, chosen: Path | None) -> Path | None:
+    """The folder of masks outside the photographs' folder: the one that was chosen, or one called
+    masks beside it."""
+    return chosen or folder_beside(photos, (FOLDER,))
+
+
+def check_rig_mask(file: Path | None) -> None:
+    """Raises SplatError "file-missing" if the mask of all panoramas was given and is no file: where
+    no picture is a panorama it would never be opened."""
+    if file is not None and not file.is_file():
+        raise SplatError(
+            "file-missing",
+            given=f"--rig-mask {file} {'is a folder' if file.is_dir() else 'does not exist'}.",
+            wanted="A picture twice as wide as high, black where all panoramas show the stand.",
+            hint="Check the path; masks of single photographs are given with --masks.",
+        )
+
+
+def check_pairing(found: Findings, apart: Path | None, chosen: Path | None) -> None:
+    """Check that masks which were given belong to photographs.
+
+    Args:
+        found: what the capture's folder holds.
+        apart: the folder of masks that was searched: `chosen`, or one found beside.
+        chosen: the folder that was given as a setting.
+
+    Raises:
+        SplatError: "masks-missing" if `chosen` holds none, "masks-of-others" if no mask belongs to
+            a photograph by its name.
+    """
+    if found.masks or (chosen is None and (apart is not None or not found.stray_masks)):
+        return
+    if chosen is not None and not found.stray_masks:
+        raise SplatError(
+            "masks-missing",
+            given=f"{chosen} holds no masks of photographs.",
+            wanted="A folder of grey pictures, named as the photographs are.",
+            hint="Check the path.",
+        )
+    photograph, mask = (found.sources or found.videos)[0].name, found.stray_masks[0]
+    stem = PurePosixPath(photograph).stem
+    raise SplatError(
+        "masks-of-others",
+        given=f"No mask belongs to a photograph by its name: {mask}, say, and {photograph}.",
+        wanted=f"For {photograph}: {stem}.png, {photograph}.png or {stem}_mask.png.",
+        hint="If they are masks of another capture, remove them, or name a folder with --masks.",
+    )
+
+
+def names_for(photograph: str, ending: str = "_mask") -> tuple[str, ...]:
+    """Names that the mask of a photograph ("day 1/a.jpg") may have, case-folded, without its own
+    suffix: those of COLMAP (a.jpg.png), nerfstudio (a.png) and Metashape (a_mask.png)."""
+    stem = str(PurePosixPath(photograph).with_suffix(""))
+    return photograph.casefold(), stem.casefold(), f"{stem}{ending}".casefold()
+
+
+def pair_masks(
+    photographs: Iterable[str], masks: Mapping[str, Path], ending: str = "_mask"
+) -> dict[str, Path]:
+    """The mask of each photograph that has one, by the photograph's name.
+
+    The folder of masks need not have the photographs' sub-folders if no name is used twice.
+
+    Args:
+        photographs: names relative to their folder.
+        masks: by name relative to theirs.
+        ending: see `names_for`.
+    """
+    photographs = list(photographs)
+    by_stem = {stem_of(name): path for name, path in sorted(masks.items())}
+    found = {}
+    for name in photographs:
+        match = next((by_stem[key] for key in names_for(name, ending) if key in by_stem), None)
+        if match is not None:
+            found[name] = match
+    bare = [PurePosixPath(name).name for name in photographs]
+    if not found and len({name.casefold() for name in bare}) == len(bare):
+        short = {PurePosixPath(name).name: path for name, path in sorted(masks.items())}
+        if short != dict(masks) or bare != photographs:
+            again = pair_masks(bare, short, ending)
+            found = {
+                name: again[last]
+                for name, last in zip(photographs, bare, strict=True)
+                if last in again
+            }
+    return found
+
+
+def masks_beside(photographs: Iterable[str]) -> dict[str, str]:
+    """Files of a folder that are masks of others there (a.jpg.png or a_mask.png beside a.jpg): the
+    photograph's name by the mask's."""
+    photographs = list(photographs)
+    by_key = {}
+    for name in photographs:
+        whole, _, marked = names_for(name)
+        by_key[whole] = by_key[marked] = name
+    return {name: by_key[stem_of(name)] for name in photographs if stem_of(name) in by_key}

@@ -1,1 +1,0 @@
-"""Evaluation of pictures, the contribution of each splat, capture coverage, trade-off reports."""

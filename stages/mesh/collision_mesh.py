@@ -1,0 +1,170 @@
+"""Splats and their cameras -> the collision mesh and its quality figures.
+
+Also: vertex colours of the mesh from the drawn views.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.base.errors import Interrupted
+from stages.base.stage import Report
+from stages.mesh import depth_maps, extract, fuse
+from stages.mesh.depth_maps import DepthMap
+from stages.mesh.distance import distances_to_mesh
+from stages.raster.draw import raster_settings_of
+from stages.scene import Reconstruction, Splats, split_held_out
+from stages.scene.mesh import Mesh
+
+_COVERED_VOXELS = 2.0  # largest distance of a covered surface from the mesh
+_SAMPLES = 200_000  # pixels that the covered share is measured on
+_LOW_COVERAGE = 0.7
+
+
+@dataclass(frozen=True)
+class CollisionMesh:
+    """A mesh and its figures, JSON values. Lengths are in world units.
+
+    triangles, vertices, watertight, voxel, removed_components.
+    covered_share: of the pixels with depth in the training cameras, the share whose surface (median
+    depth) lies within two voxels of the mesh. Surfaces outside the fused box are not covered.
+    sparse_points_inside_share: the share of sparse points inside the fused box. For these:
+    sparse_median_distance, sparse_p90_distance to the nearest triangle, and both relative to the
+    diagonal of the box; None where there are no such points.
+    """
+
+    mesh: Mesh
+    figures: dict[str, Any]
+
+
+def make_collision_mesh(
+    splats: Splats, reconstruction: Reconstruction, triangles: int, backend: str, report: Report
+) -> CollisionMesh:
+    """The mesh of what the training cameras see, with at most about `triangles` triangles.
+
+    Equal inputs give an equal mesh, unless a lack of memory enlarges the voxels.
+    Warnings: export-mesh-empty, export-mesh-coarse, export-mesh-gaps. Raises Interrupted.
+    """
+    training, _ = split_held_out(reconstruction.views)
+    cameras = depth_maps.select_cameras([view.camera for view in training])
+
+    def tick(number: int) -> None:
+        if report.stop_requested.is_set():
+            raise Interrupted(f"stopped after {number} of {len(cameras)} cameras")
+        report.progress(number, len(cameras), "drawing depth")
+
+    maps = depth_maps.draw_depth_maps(splats, cameras, backend, tick)
+    report.progress(len(cameras), len(cameras), "fusing depth")
+    region = fuse.observed_box(maps)
+    if region is None:
+        return _empty_mesh(report)
+    voxels = fuse.voxel_budget()
+    if voxels < fuse.VOXELS:
+        report.warn(
+            "export-mesh-coarse",
+            f"Memory is short: the mesh was made of {voxels:,} voxels instead of "
+            f"{fuse.VOXELS:,}. Close other programs and export again for a finer one.",
+        )
+    near = raster_settings_of(splats).near
+    volume = fuse.fuse_depth_maps(maps, fuse.empty_volume(*region, voxels), near)
+    fine, removed = extract.remove_small_components(extract.extract_surface(volume))
+    mesh = extract.simplify(fine, triangles)
+    if not len(mesh.faces):
+        return _empty_mesh(report)
+    mesh = colour_vertices(mesh, maps, fuse.TRUNCATION * volume.voxel)
+    mesh = replace(mesh, origin=splats.origin, place=splats.place)
+    covered = _covered(mesh, maps, volume.voxel)
+    figures = {
+        "triangles": len(mesh.faces),
+        "vertices": len(mesh.vertices),
+        "watertight": mesh.is_watertight,
+        "voxel": _rounded(volume.voxel),
+        "removed_components": removed,
+        "covered_share": covered,
+        **_sparse_point_figures(mesh, reconstruction.points, volume),
+    }
+    _warn_of_gaps(covered, report)
+    return CollisionMesh(mesh, figures)
+
+
+def _empty_mesh(report: Report) -> CollisionMesh:
+    report.warn(
+        "export-mesh-empty",
+        "The mesh is empty: no training camera sees a solid surface. Look at the splats with "
+        "`splat view`.",
+    )
+    return CollisionMesh(Mesh.empty(), {"triangles": 0, "vertices": 0, "covered_share": 0.0})
+
+
+def _warn_of_gaps(covered: float, report: Report) -> None:
+    if covered < _LOW_COVERAGE:
+        report.warn(
+            "export-mesh-gaps",
+            f"The mesh covers only {covered:.0%} of what the training photographs show; the rest "
+            "is far away, or its depth differs between cameras.",
+        )
+
+
+def _covered(mesh: Mesh, maps: list[DepthMap], voxel: float) -> float:
+    """`covered_share` of CollisionMesh."""
+    pixels = sum(int((found.depth > 0).sum()) for found in maps)
+    step = max(1, pixels // _SAMPLES)
+    solid = [replace(found, weight=(found.depth > 0).astype(np.float32)) for found in maps]
+    places = np.concatenate([found.points(step) for found in solid])
+    near = distances_to_mesh(places, mesh, voxel) <= _COVERED_VOXELS * voxel
+    return round(float(near.mean()), 4)
+
+
+def _sparse_point_figures(
+    mesh: Mesh, points: NDArray[np.float64], volume: fuse.Volume
+) -> dict[str, float | None]:
+    inside = np.all((points >= volume.corner) & (points <= volume.far_corner), axis=1)
+    share = float(inside.mean()) if len(points) else 0.0
+    figures: dict[str, float | None] = {"sparse_points_inside_share": round(share, 4)}
+    found = distances_to_mesh(points[inside], mesh, volume.voxel)
+    diagonal = float(np.linalg.norm(volume.far_corner - volume.corner))
+    for name, percent in (("median", 50), ("p90", 90)):
+        value = float(np.percentile(found, percent)) if len(found) else None
+        figures[f"sparse_{name}_distance"] = _rounded(value)
+        figures[f"sparse_{name}_distance_share"] = _rounded(value and value / diagonal)
+    return figures
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else float(f"{value:.4g}")
+
+
+def colour_vertices(mesh: Mesh, maps: list[DepthMap], tolerance: float) -> Mesh:
+    """The mesh with colours: the weighted mean of the pixels that see each vertex.
+
+    tolerance: the largest distance in depth between a pixel and a vertex that it sees, world units.
+    A vertex that no pixel sees takes the colour of the nearest one that is seen.
+    """
+    from scipy.spatial import cKDTree
+
+    if not len(mesh.vertices):
+        return mesh
+    sums, weights = np.zeros((len(mesh.vertices), 3)), np.zeros(len(mesh.vertices))
+    for found in maps:
+        camera = found.camera
+        pixels, z = camera.project(mesh.vertices.astype(np.float64))
+        inside = (z > 0) & camera.shows(pixels)
+        columns, rows = pixels[inside].astype(int).T
+        agrees = np.abs(found.depth[rows, columns] - z[inside]) < tolerance
+        seen = np.flatnonzero(inside)[agrees]
+        rows, columns = rows[agrees], columns[agrees]
+        weight = found.weight[rows, columns].astype(np.float64)
+        sums[seen] += weight[:, None] * found.colour[rows, columns]
+        weights[seen] += weight
+    known = weights > 0
+    if not known.any():
+        return mesh
+    colours = np.zeros((len(weights), 3))
+    colours[known] = sums[known] / weights[known, None]
+    _, nearest = cKDTree(mesh.vertices[known]).query(mesh.vertices[~known])
+    colours[~known] = colours[known][nearest]
+    return replace(mesh, colours=np.rint(colours).astype(np.uint8))

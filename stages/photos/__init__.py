@@ -1,1 +1,0 @@
-"""Reading photographs: decoding, EXIF, colour, and what to shoot again."""

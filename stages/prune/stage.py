@@ -1,0 +1,233 @@
+"""Stage 5: removes floaters and splats that do not improve the pictures.
+
+Training views choose what is removed and bound the loss (see `prune.rounds`). The PSNR (dB) of
+the held-out views before and after is in the report, and decides nothing.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from stages.base.settings import setting
+from stages.base.stage import Report, Stage
+from stages.formats.table import FORMATS
+from stages.prune.shared import DECIDING_VIEWS, SOG_LOSS_DB
+from stages.raster.backends import (
+    backend_of_settings,
+    backend_setting,
+    device_setting,
+    report_backend,
+)
+
+if TYPE_CHECKING:
+    from stages.evaluate.evaluation import EvaluationView
+    from stages.prune.rounds import Pruner, PruningResult
+    from stages.scene import Reconstruction, Splats, TrainedSplats
+
+
+@dataclass(frozen=True)
+class PruneSettings:
+    """Settings of pruning."""
+
+    rounds: int = setting(
+        8, "Rounds of pruning, each of a tenth of the splats at most; 0 for none.", min=0, max=100
+    )
+    strength: float = setting(
+        1.0,
+        "Pruning strength: larger removes more, and allows more loss.",
+        panel="Size",
+        min=0.001,
+        max=1000,
+    )
+    max_loss_db: float = setting(
+        0.1,
+        "Mean PSNR that held-out views may lose, at strength 1 (dB); none may lose more than 0.3.",
+        min=0,
+        max=100,
+    )
+    max_splats: int = setting(
+        0, "Splats at most, whatever the loss; 0 for any number.", min=0, max=100_000_000
+    )
+    max_mb: float = setting(
+        0.0,
+        "Size at most, whatever the loss, of the file that --mb-of names; 0 for any (megabytes).",
+        panel="Size",
+        min=0,
+        max=1_000_000,
+    )
+    mb_of: str = setting(
+        "ply", "Format that --max-mb is about", panel="Size", choices=tuple(FORMATS)
+    )
+    min_psnr: float = setting(
+        0.0,
+        "Remove as much as leaves the training views this PSNR, instead of by "
+        "--strength; 0 for none (dB).",
+        panel="Size",
+        min=0,
+        max=99,
+    )
+    finetune_steps: int = setting(
+        90,
+        "Steps of fine-tuning after each round that a target needs; 0 for none.",
+        panel="Advanced",
+        min=0,
+        max=100_000,
+    )
+    seconds: float = setting(
+        0.0, "Time limit in seconds: no round begins after it. 0: no limit.", min=0, max=1e7
+    )
+    backend: str = backend_setting()
+    device: str = device_setting()
+
+
+def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report: Report) -> Splats:
+    """Prune inputs["train"] by the training views of inputs["sfm"]; write the rest to `folder`.
+
+    The report gets each round, counts, and the PSNR before and after. Raises SplatError for targets
+    that cannot be met, and Interrupted.
+    """
+    import numpy as np
+
+    from stages.evaluate.evaluation import load_evaluation_views, psnr_of_views_db
+    from stages.prune.summary import advise_more_splats, describe_loss, summarise
+    from stages.scene import split_held_out
+    from stages.scene.storage import save_splats
+
+    deadline = time.monotonic() + (settings.seconds or math.inf)
+    trained: TrainedSplats = inputs["train"]
+    reconstruction: Reconstruction = inputs["sfm"].with_cameras(trained.cameras)
+    splats, backend = trained.splats, backend_of_settings(settings)
+    training, held_out = (
+        load_evaluation_views(
+            reconstruction.folder, views, splats.draw_settings, report.stop_requested
+        )
+        for views in split_held_out(reconstruction.views)
+    )
+    evaluated = held_out or training
+    before_db = psnr_of_views_db(splats, evaluated, backend)
+    pruner = pruner_of(settings, reconstruction, trained, training, backend, report, deadline)
+    found = pruner.prune(splats)
+    loss_db = before_db - psnr_of_views_db(found.splats, evaluated, backend)
+    report_backend(report, backend)
+    report.metric("evaluated_side_px", splats.draw_settings.side)
+    mean_db, lost_db = float(before_db.mean()), float(loss_db.mean())
+    report.metric("psnr_before_db", round(mean_db, 3))
+    report.metric("psnr_db", round(mean_db - lost_db, 3))
+    report.metric("psnr_change_db", round(-lost_db, 3))
+    report.metric("psnr_change_worst_view_db", round(-float(loss_db.max()), 3))
+    report.metric("finetune_steps", pruner.finetuner.steps)
+    _report_result(splats, found, report)
+    report.metric("summary", summarise(trained, found, settings.strength, pruner.finetuner.steps))
+    overridden = settings.max_splats or settings.max_mb or settings.min_psnr
+    if pruner.targets.broken_by(loss_db) and not overridden:
+        report.warn("prune-loss-above-limit", describe_loss(loss_db, pruner.targets))
+    if advice := advise_more_splats(found, settings.strength):
+        report.warn("prune-more-would-pay", advice)
+    assert np.isfinite(found.splats.means).all()
+    save_splats(folder, found.splats)
+    return found.splats
+
+
+def pruner_of(
+    settings: PruneSettings,
+    reconstruction: Reconstruction,
+    trained: TrainedSplats,
+    training: Sequence[EvaluationView],
+    backend: str,
+    report: Report,
+    deadline: float = math.inf,
+) -> Pruner:
+    """What prunes the splats of `trained`.
+
+    Args:
+        settings: of the stage.
+        reconstruction: with the cameras that training refined.
+        trained: what was trained.
+        training: the training views.
+        backend: name of the rasteriser.
+        report: for progress.
+        deadline: after which no round begins, as `time.monotonic`.
+    """
+    from stages.prune.rounds import Pruner
+    from stages.prune.targets import Targets
+    from stages.scene import training_extent
+    from stages.train.finetune import FineTuner
+
+    extent = training_extent(reconstruction)
+    finetuner = FineTuner(training, extent, backend, report, trained.dropout)
+    targets = Targets(
+        strength=settings.strength,
+        max_loss_db=settings.max_loss_db,
+        max_splats=settings.max_splats,
+        max_bytes=settings.max_mb * 1e6,
+        min_psnr_db=settings.min_psnr,
+        size_bytes=_size_measure(settings, trained.splats, training, reconstruction),
+    )
+    limits = settings.rounds, settings.finetune_steps
+    return Pruner(training, targets, backend, finetuner, *limits, report, deadline)
+
+
+def _size_measure(
+    settings: PruneSettings,
+    splats: Splats,
+    training: Sequence[EvaluationView],
+    reconstruction: Reconstruction,
+) -> Callable[[Splats], int]:
+    """Gives the size of the file that --max-mb is about. A .sog is written with the bit depths that
+    `quantise` chooses for all splats: they hardly depend on how many are left."""
+    from stages.evaluate.evaluation import mean_psnr_db
+    from stages.formats.sog_bits import choose_bits, file_size_bytes
+    from stages.scene import evenly_spaced
+
+    row = FORMATS[settings.mb_of]
+    depths: dict[str, int] = {}
+    if settings.max_mb and row.quantiser:
+        views, backend = evenly_spaced(training, DECIDING_VIEWS), backend_of_settings(settings)
+        depths, _ = choose_bits(splats, lambda s: mean_psnr_db(s, views, backend), SOG_LOSS_DB)
+    return lambda s: file_size_bytes(row, s, depths, reconstruction.units, reconstruction.views)
+
+
+def _report_result(before: Splats, found: PruningResult, report: Report) -> None:
+    """Counts, the rate-distortion cost and the rounds as metrics; a warning for many floaters."""
+    floaters = sum(one.floaters for one in found.rounds if one.kept)
+    start, after, cost = len(before), found.splats, found.rate_distortion
+    degrees = [int((after.sh_degrees == d).sum()) for d in range(after.sh_degree + 1)]
+    report.metric("splats_before", start)
+    report.metric("splats", len(after))
+    report.metric("floaters_removed", floaters)
+    report.metric("unneeded_removed", start - len(after) - floaters)
+    report.metric("splats_by_sh_degree", degrees)
+    cost_figures = asdict(cost) | {"bits_per_parameter": cost.bits_per_parameter}
+    report.metric("rate_distortion", cost_figures)
+    report.metric("training_psnr_before_db", round(found.start_db, 3))
+    report.metric("training_psnr_db", round(found.end_db, 3))
+    report.metric("stopped_by", found.stopped_by)
+    report.metric("rounds", [asdict(one) for one in found.rounds])
+    if floaters > 0.05 * start:
+        report.warn(
+            "prune-many-floaters",
+            f"{floaters:,} of {start:,} splats were floaters in free space near cameras. "
+            "Photographs with more overlap, and a locked exposure, leave fewer.",
+        )
+
+
+def load(folder: Path) -> Splats:
+    """The pruned splats."""
+    from stages.scene.storage import load_splats
+
+    return load_splats(folder)
+
+
+STAGE = Stage(
+    name="prune",
+    version=22,
+    reads=("sfm", "train"),
+    settings_type=PruneSettings,
+    run=run,
+    load=load,
+)

@@ -1,0 +1,330 @@
+"""Stage 6: chooses at which precision splats are stored, and fine-tunes them to the rounding of the
+requested file formats.
+
+View-dependent colour takes up to three quarters of a file. The SH degree is lowered, for all splats
+and then for each, as far as training views do not show it. Held-out views measure the result and
+decide nothing. What the 8-bit .splat costs is measured, too.
+
+Splats that were trained with opacity compensation are fine-tuned for the formats that are drawn
+without it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from stages.base.bad_files import reading, stage_output
+from stages.base.errors import RunFolderError
+from stages.base.settings import setting
+from stages.base.stage import Report, Stage
+from stages.formats.output_formats import (
+    CHOICES,
+    DEFAULT_FORMATS,
+    drawing_setting,
+    formats_setting,
+    formats_to_finetune,
+)
+from stages.formats.table import AUTO, FORMATS, PLAIN
+from stages.prune.shared import DECIDING_VIEWS, SOG_LOSS_DB
+from stages.raster.backends import (
+    backend_of_settings,
+    backend_setting,
+    device_setting,
+    report_backend,
+)
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from stages.evaluate.evaluation import EvaluationView
+    from stages.scene import DrawSettings, QuantisedSplats, Reconstruction, Splats, TrainedSplats
+
+_DECISIONS, _FLAT, _FINETUNED = "decisions.json", "flat_dc.npy", "finetuned"
+_SOG = "sog"  # the format whose bits are chosen
+# Change of colour (of 255) that a splat's higher SH degrees may make and still be dropped, largest
+# first.
+_THRESHOLDS_OF_255 = (8.0, 4.0, 2.0, 1.0, 0.5, 0.25)
+_BIT_DEPTH_MEASUREMENTS = 25  # about, for the progress bar
+
+
+@dataclass(frozen=True)
+class QuantiseSettings:
+    """Settings of the choice of precision. Of the formats, only those that need fine-tuning are
+    kept: a further lossless format changes nothing here."""
+
+    max_loss_db: float = setting(
+        0.02, "PSNR of training views that lower SH degrees may cost (dB).", min=0, max=100
+    )
+    sog_loss_db: float = setting(
+        SOG_LOSS_DB,
+        "PSNR of training views that fewer bits in a .sog may cost besides, before "
+        "fine-tuning recovers a part of it (dB).",
+        min=0,
+        max=100,
+    )
+    max_views: int = setting(
+        DECIDING_VIEWS, "Training views to measure on, at most.", min=1, max=100_000
+    )
+    formats: tuple[str, ...] = formats_setting(
+        formats_to_finetune(DEFAULT_FORMATS, AUTO),
+        "File format to fine-tune the splats to; repeatable. Formats that need no fine-tuning "
+        "change nothing",
+        may_be_empty=True,
+    )
+    drawing: str = drawing_setting()
+    plain_steps: int = setting(
+        300,
+        "Steps of fine-tuning of antialiased splats for formats that are drawn plainly.",
+        min=0,
+        max=100_000,
+    )
+    rounding_steps: int = setting(
+        45,
+        "Steps of fine-tuning after each attribute that a format rounds (.splat, .spz, "
+        ".sog, .compressed.ply); 0 for none.",
+        min=0,
+        max=100_000,
+    )
+    backend: str = backend_setting()
+    device: str = device_setting()
+
+    def __post_init__(self) -> None:
+        unknown = tuple(name for name in self.formats if name not in CHOICES)  # refused by checks
+        known = formats_to_finetune(self.formats, self.drawing)
+        object.__setattr__(self, "formats", (*known, *unknown))
+
+
+def run(
+    inputs: Mapping[str, Any], settings: QuantiseSettings, folder: Path, report: Report
+) -> QuantisedSplats:
+    """Decide on the splats of inputs["prune"] by training views of inputs["sfm"].
+
+    Metrics: psnr_raw_db, psnr_kept_db, psnr_splat32_db (means over the held-out views, or over
+    the deciding views where none are held out), sh_degree, splats_by_sh_degree, bits (if a .sog is
+    requested), raw_mib, kept_mib; formats: by format that was fine-tuned to, rounded_db and
+    finetuned_db (see `quantise.format_finetuning`). Raises SplatError if a photograph cannot be
+    read, and Interrupted.
+    """
+    from stages.formats.sog_bits import choose_bits
+    from stages.formats.sog_quantisation import splats_to_write
+    from stages.quantise.format_finetuning import FormatFinetuning
+    from stages.quantise.rounding import write_and_read
+    from stages.scene import QuantisedSplats
+
+    splats: Splats = inputs["prune"]
+    trained: TrainedSplats = inputs["train"]
+    reconstruction = inputs["sfm"].with_cameras(trained.cameras)
+    decider, evaluator = _measures(reconstruction, splats.draw_settings, settings, report)
+    kept, by_degree, threshold = _choose_sh_degrees(splats, settings, decider)
+    finetuning = FormatFinetuning.of(
+        kept, reconstruction, trained.dropout, settings, decider.views, report
+    )
+    plain = finetuning.to_plain_drawing(kept)
+    flat = _flat_colours(kept if plain is None else plain, reconstruction, settings)
+    quantised = QuantisedSplats(kept, {}, flat, plain=plain, drawing=settings.drawing)
+    bits, sog_db = None, None
+    if _SOG in settings.formats:
+        sog = splats_to_write(FORMATS[_SOG], quantised)
+        bits, sog_db = choose_bits(sog, decider.psnr, settings.sog_loss_db)
+    figures = {
+        "psnr_raw_db": evaluator.psnr(splats),
+        **evaluator.psnr_at_sizes(kept, "psnr_kept"),
+        "psnr_plain_db": None if plain is None else evaluator.psnr(plain),
+        "psnr_splat32_db": evaluator.psnr(
+            write_and_read(FORMATS["splat"], splats_to_write(FORMATS["splat"], quantised))
+        ),
+        "sh_degree": kept.sh_degree,
+        "splats_by_sh_degree": [
+            int((kept.sh_degrees == d).sum()) for d in range(kept.sh_degree + 1)
+        ],
+        "bits": bits,
+        "measured_on": evaluator.what,
+    }
+    decisions: dict[str, object] = {
+        **figures,
+        "psnr_sog_training_db": sog_db,
+        "max_loss_db": settings.max_loss_db,
+        "drawing": settings.drawing,
+        "colour_loss_of_255": threshold,
+        "views": len(decider.views),
+        "psnr_by_sh_degree_db": {str(d): by_degree[d] for d in sorted(by_degree)},
+    }
+    for name, value in figures.items():
+        report.metric(name, value)
+    report.metric("raw_mib", round(_bytes(splats) / 2**20, 3))
+    report.metric("kept_mib", round(_bytes(kept) / 2**20, 3))
+    report.metric("evaluated_side_px", splats.draw_settings.side)
+    report_backend(report, backend_of_settings(settings))
+    quantised = replace(quantised, decisions=decisions)
+    quantised = replace(quantised, finetuned=finetuning.to_rounding(quantised))
+    _save(folder, quantised)
+    return quantised
+
+
+def _choose_sh_degrees(
+    splats: Splats, settings: QuantiseSettings, decider: _Measure
+) -> tuple[Splats, dict[int, float], float]:
+    """(splats without the SH coefficients that training views do not show; PSNR by the SH degree
+    of all; the threshold at which single splats have lost degrees, of 255)."""
+    import numpy as np
+
+    from stages.evaluate.sh import sufficient_degrees, truncate_sh
+
+    raw_db = decider.psnr(splats)
+    by_degree, kept = {splats.sh_degree: raw_db}, splats
+    for lower in range(splats.sh_degree):
+        candidate = splats.with_sh_degree(lower)
+        by_degree[lower] = decider.psnr(candidate)
+        if raw_db - by_degree[lower] < settings.max_loss_db:
+            kept = candidate
+            break
+    for threshold in _THRESHOLDS_OF_255 if kept.sh_degree else ():
+        degrees = sufficient_degrees(kept, threshold / 255)
+        if np.array_equal(degrees, kept.sh_degrees):
+            continue
+        candidate = truncate_sh(kept, degrees)
+        if raw_db - decider.psnr(candidate) < settings.max_loss_db:
+            return candidate, by_degree, threshold
+    return kept, by_degree, 0.0
+
+
+def _flat_colours(
+    splats: Splats, reconstruction: Reconstruction, settings: QuantiseSettings
+) -> NDArray[np.float32] | None:
+    """[N, 3] DC coefficients for formats without view dependence; None where `splats` have none."""
+    from stages.evaluate.sh import view_averaged_dc
+    from stages.scene import split_held_out
+
+    if not splats.sh_degree:
+        return None
+    views = split_held_out(reconstruction.views)[0]
+    cameras = (splats.draw_settings.camera(view.camera) for view in views)
+    return view_averaged_dc(splats, cameras, backend_of_settings(settings))
+
+
+def _bytes(splats: Splats) -> int:
+    """As float32 with the same SH degree for all and 11 other values, which is what most formats
+    hold; each splat's own degree helps only formats that compress zeros."""
+    found: int = 4 * len(splats) * (11 + 3 * splats.sh.shape[1])
+    return found
+
+
+def _measures(
+    reconstruction: Reconstruction,
+    draw_settings: DrawSettings,
+    settings: QuantiseSettings,
+    report: Report,
+) -> tuple[_Measure, _Measure]:
+    """(what decides: training views; what evaluates: held-out views if there are any)."""
+    from stages.evaluate.evaluation import load_evaluation_views
+    from stages.scene import evenly_spaced, split_held_out
+
+    training, held_out = split_held_out(reconstruction.views)
+    if not training:
+        raise RunFolderError(
+            "quantise-no-views",
+            given="The reconstruction has no photographs.",
+            wanted="At least one, to measure on.",
+            hint="Run `splat sfm` again.",
+        )
+    deciding = tuple(evenly_spaced(training, settings.max_views))
+    evaluated, what = (held_out, "held out") if held_out else (deciding, "training")
+    folder, backend = reconstruction.folder, backend_of_settings(settings)
+    decider, evaluator = (
+        load_evaluation_views(folder, views, draw_settings, report.stop_requested)
+        for views in (deciding, evaluated)
+    )
+    # As it is, three lower degrees, each threshold, and about as many bit depths.
+    planned = 5 + len(_THRESHOLDS_OF_255) + _BIT_DEPTH_MEASUREMENTS * (_SOG in settings.formats)
+    return _Measure(decider, backend, report, planned), _Measure(
+        evaluator, backend, Report(), what=what
+    )
+
+
+@dataclass
+class _Measure:
+    """Measures splats on views that are loaded once. planned: about how many times."""
+
+    views: Sequence[EvaluationView]
+    backend: str
+    report: Report
+    planned: int = 0
+    what: str = "training"
+    done: int = 0
+
+    def psnr(self, splats: Splats, scale: float = 1.0) -> float:
+        """Mean PSNR over the views at `scale` times their size (dB)."""
+        from stages.evaluate.evaluation import mean_psnr_db
+
+        mean = round(mean_psnr_db(splats, self.views, self.backend, scale), 4)
+        self.done += 1
+        total = max(self.planned, self.done)
+        self.report.progress(self.done, total, "measuring", psnr_db=mean)
+        return mean
+
+    def psnr_at_sizes(self, splats: Splats, stem: str) -> dict[str, float]:
+        """Mean PSNR at each of `SIZES`, by the name of the metric."""
+        from stages.evaluate.evaluation import SIZES, psnr_name
+
+        return {psnr_name(size, stem): self.psnr(splats, scale) for size, scale in SIZES.items()}
+
+
+def _save(folder: Path, quantised: QuantisedSplats) -> None:
+    import shutil
+
+    import numpy as np
+
+    from stages.base.atomic import replacing
+    from stages.scene import save_splats
+
+    shutil.rmtree(folder / _FINETUNED, ignore_errors=True)  # of an interrupted run
+    save_splats(folder, quantised.splats)
+    decisions = json.dumps(quantised.decisions, indent=1) + "\n"
+    (folder / _DECISIONS).write_text(decisions, encoding="utf-8")
+    if quantised.flat_dc is not None:
+        with replacing(folder / _FLAT) as path, path.open("wb") as file:
+            np.save(file, quantised.flat_dc)
+    held = dict(quantised.finetuned) | ({} if quantised.plain is None else {PLAIN: quantised.plain})
+    for name, splats in held.items():
+        (folder / _FINETUNED / name).mkdir(parents=True, exist_ok=True)
+        save_splats(folder / _FINETUNED / name, splats)
+
+
+def load(folder: Path) -> QuantisedSplats:
+    """The decision in a finished folder. Raises SplatError if it is damaged."""
+    import numpy as np
+
+    from stages.scene import QuantisedSplats, load_splats
+
+    splats = load_splats(folder)
+    finetuned = {
+        path.name: load_splats(path)
+        for path in sorted((folder / _FINETUNED).glob("*"))
+        if path.is_dir()
+    }
+    with reading(folder / _DECISIONS, stage_output("quantise-folder-damaged")):
+        decisions = json.loads((folder / _DECISIONS).read_text(encoding="utf-8"))
+        flat = np.load(folder / _FLAT) if (folder / _FLAT).exists() else None
+        return QuantisedSplats(
+            splats,
+            decisions,
+            flat,
+            plain=finetuned.pop(PLAIN, None),
+            finetuned=finetuned,
+            drawing=decisions["drawing"],
+        )
+
+
+STAGE = Stage(
+    name="quantise",
+    version=13,
+    reads=("sfm", "train", "prune"),
+    settings_type=QuantiseSettings,
+    run=run,
+    load=load,
+)

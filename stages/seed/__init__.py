@@ -1,0 +1,1 @@
+"""Stage 3: `Reconstruction` -> the first `Splats`: at sparse points, and where there are none."""

@@ -1,0 +1,198 @@
+"""Stage 3: Reconstruction -> Splats: initial splats from the sparse points, without outliers.
+
+Follows the reference trainer (Kerbl et al., 3D Gaussian Splatting, 2023, section 5.1): one round
+splat a point, as large as the mean distance to its three nearest neighbours, opacity 0.1. Points of
+a plane sweep, measured depth and filled cells are added (`seed`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from stages.base.errors import ReconstructionError, SplatError
+from stages.base.settings import setting
+from stages.base.stage import Report, Stage
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from stages.scene import Reconstruction, Splats
+
+OPACITY = 0.1
+NEIGHBOURS = 3
+_FEWEST_SPLATS = 50
+_FAR = 8.0  # x the radius that contains nine tenths of the points, or of the cameras
+_FAR_WEAK = 4.0  # the same for points with only two observations
+_HIGH_ERROR = 4.0  # x the median reprojection error
+_AT_A_CAMERA = 0.05  # x the median distance from a point to its nearest camera
+_SMALLEST_SCALE = 0.1  # x the median scale: duplicates are at distance 0
+_LARGEST_SCALE = 0.05  # x the distance to the nearest camera: 3 degrees to either side
+
+
+@dataclass(frozen=True)
+class SeedSettings:
+    """Settings of the initial splats."""
+
+    keep_outliers: bool = setting(False, "Keep points that look misplaced or are far away.")
+    fill: bool = setting(True, "Add splats where photographs show surfaces without points.")
+
+
+def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report: Report) -> Splats:
+    """Splats of SH degree 0 from inputs["sfm"], written to `folder`.
+
+    Raises SplatError "seed-too-few-points" if fewer than 50 points are usable.
+    """
+    import numpy as np
+
+    from stages.scene import Splats, draw_settings_of, logit, rgb_to_dc, split_held_out
+    from stages.scene.storage import save_splats
+    from stages.seed.empty_cells import fill_cells
+    from stages.seed.measured_depth import measured_points
+    from stages.seed.plane_sweep import plane_sweep_points
+    from stages.seed.view_selection import selected_views
+
+    reconstruction: Reconstruction = inputs["sfm"]
+    finite: NDArray[np.bool_] = np.all(np.isfinite(reconstruction.points), axis=1)
+    reasons: dict[str, NDArray[np.bool_]] = {"not_finite": ~finite}
+    if not settings.keep_outliers and finite.any():
+        reasons |= _outliers(reconstruction, finite)
+    keep = ~np.logical_or.reduce(list(reasons.values()))
+    _report_outliers(reasons, keep, report)
+    points = reconstruction.points[keep]
+    if len(points) < _FEWEST_SPLATS:
+        raise _too_few(len(points), len(reconstruction.points))
+    colours = reconstruction.colours[keep].astype(np.float64) / 255.0
+    training, _ = split_held_out(reconstruction.views)  # held-out views give no points or colours
+    if settings.fill:
+        chosen = selected_views(training, points)
+        more, more_colours = plane_sweep_points(reconstruction.folder, chosen, points)
+        report.metric("plane_sweep_points", len(more))
+        points, colours = np.concatenate([points, more]), np.concatenate([colours, more_colours])
+        if any(view.depth for view in chosen):
+            more, more_colours = measured_points(reconstruction.folder, chosen, points, report)
+            report.metric("measured_points", len(more))
+            points = np.concatenate([points, more])
+            colours = np.concatenate([colours, more_colours])
+    scales, clamped = _scales(points, reconstruction)
+    report.metric("median_scale", float(np.median(scales)))
+    report.metric("scales_clamped", clamped)
+    if settings.fill:
+        cameras = tuple(view.camera for view in reconstruction.views)
+        more, more_colours, more_scales = fill_cells(
+            reconstruction.folder, chosen, points, cameras, training
+        )
+        report.metric("filled_cells", len(more))
+        points, colours = np.concatenate([points, more]), np.concatenate([colours, more_colours])
+        scales = np.concatenate([scales, more_scales])
+    report.progress(1, 1, "seeding", splats=len(points))
+    splats = Splats(
+        means=points.astype(np.float32),
+        quaternions=np.tile(np.array([1, 0, 0, 0], np.float32), (len(points), 1)),
+        log_scales=np.repeat(np.log(scales)[:, None], 3, axis=1).astype(np.float32),
+        opacity_logits=np.full(len(points), logit(OPACITY), np.float32),
+        sh=rgb_to_dc(colours)[:, None, :].astype(np.float32),
+        sh_degrees=np.zeros(len(points), np.uint8),
+        origin=reconstruction.origin.copy(),
+        draw_settings=draw_settings_of(reconstruction.views),
+    )
+    save_splats(folder, splats)
+    report.metric("splats", len(splats))
+    return splats
+
+
+def load(folder: Path) -> Splats:
+    """The splats of a finished folder."""
+    from stages.scene.storage import load_splats
+
+    return load_splats(folder)
+
+
+def _outliers(
+    reconstruction: Reconstruction, finite: NDArray[np.bool_]
+) -> dict[str, NDArray[np.bool_]]:
+    """Masks [P] of outliers, by reason."""
+    import numpy as np
+
+    from stages.seed.neighbours import nearest_distance
+
+    points = np.where(finite[:, None], reconstruction.points, 0.0)
+    errors = np.nan_to_num(reconstruction.errors_px, nan=np.inf, posinf=np.inf)
+    centres = _camera_centres(reconstruction)
+    middle = np.median(points[finite], axis=0)
+    distances = np.linalg.norm(points - middle, axis=1)
+    # Cameras count, too: a far background is normal for a capture of that size.
+    reach = float(np.percentile(distances[finite], 90))
+    if len(centres):
+        reach = max(reach, float(np.percentile(np.linalg.norm(centres - middle, axis=1), 90)))
+    far = np.where(reconstruction.tracks > 2, _FAR, _FAR_WEAK) * reach
+    to_camera = nearest_distance(points, centres)
+    typical_error = float(np.median(errors[finite]))
+    return {
+        "far_away": finite & (distances > far),
+        "at_a_camera": finite & (to_camera < _AT_A_CAMERA * np.median(to_camera[finite])),
+        "high_error": finite & (errors > _HIGH_ERROR * typical_error) & (errors > 1.0),
+    }
+
+
+def _scales(
+    points: NDArray[np.float64], reconstruction: Reconstruction
+) -> tuple[NDArray[np.float64], int]:
+    """([N] standard deviations in world units, how many were clamped).
+
+    The lower bound keeps duplicates from vanishing. The upper bound, an angle seen from the nearest
+    camera, keeps isolated points from covering the pictures.
+    """
+    import numpy as np
+
+    from stages.seed.neighbours import mean_neighbour_distance, nearest_distance
+
+    raw = mean_neighbour_distance(points, NEIGHBOURS)
+    positive = raw[raw > 0]
+    if not len(positive):
+        raise _too_few(1, len(points))
+    smallest = _SMALLEST_SCALE * float(np.median(positive))
+    largest = np.maximum(
+        smallest, _LARGEST_SCALE * nearest_distance(points, _camera_centres(reconstruction))
+    )
+    scales = np.clip(raw, smallest, largest)
+    return scales, int(np.sum(scales != raw))
+
+
+def _camera_centres(reconstruction: Reconstruction) -> NDArray[np.float64]:
+    import numpy as np
+
+    return np.array([view.camera.centre for view in reconstruction.views]).reshape(-1, 3)
+
+
+def _report_outliers(
+    reasons: dict[str, NDArray[np.bool_]], keep: NDArray[np.bool_], report: Report
+) -> None:
+    counts = {reason: int(mask.sum()) for reason, mask in reasons.items()}
+    points, total = len(keep), int((~keep).sum())
+    report.metric("points", points)
+    report.metric("outliers", total)
+    report.metric("outliers_by_reason", counts)
+    if total > 0.2 * points:
+        report.warn(
+            "seed-many-outliers",
+            f"{total} of {points} points look misplaced and were left out. Check the result with "
+            "care; photographs with more overlap give fewer outliers.",
+        )
+
+
+def _too_few(usable: int, points: int) -> SplatError:
+    return ReconstructionError(
+        "seed-too-few-points",
+        given=f"Only {usable} of {points} reconstructed points can be used.",
+        wanted=f"At least {_FEWEST_SPLATS} distinct points to start from.",
+        hint="Take more photographs with more overlap of a scene with texture, and start again.",
+    )
+
+
+STAGE = Stage(
+    name="seed", version=6, reads=("sfm",), settings_type=SeedSettings, run=run, load=load
+)

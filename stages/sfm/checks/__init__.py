@@ -1,0 +1,1 @@
+"""Configurations and their attempts, the gates that a result must pass, which one is accepted."""

@@ -1,0 +1,1 @@
+"""Known cameras: assigned by name, checked against matches, with points."""

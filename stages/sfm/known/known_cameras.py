@@ -1,0 +1,345 @@
+"""A reconstruction from known cameras: pinhole pictures, poses checked against matches, points from
+the camera file, from matches with the poses held fixed, or at random."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.base import threads
+from stages.base.errors import ReconstructionError, SplatError, UsageError
+from stages.base.stage import Report
+from stages.base.text import counted
+from stages.cameras.camera_file import FilePoints
+from stages.cameras.colmap import Observations
+from stages.cameras.table import read_cameras, read_points
+from stages.cameras.undistortion import undistorted_camera
+from stages.scene import Camera, Capture, Photo, Reconstruction
+from stages.scene.rotations import quaternions_of
+from stages.sfm.finish import COLMAP, write_reconstruction
+from stages.sfm.known.match_cameras import match_cameras
+from stages.sfm.known.pinhole_views import PinholeView, write_pinhole_views
+from stages.sfm.known.points import find_points
+from stages.sfm.place.levelling import levelling_rotation, up_direction
+from stages.sfm.place.metric_scale import KnownScale, find_metric_scale
+from stages.sfm.undistorted_images import IMAGES, PosedPhoto, mask_file
+from stages.sfm.worker import database as sqlite
+from stages.sfm.worker.job import CameraGuess, Job, prepare_work_folder
+from stages.sfm.worker.pairs import Pair
+from stages.sfm.worker.process import run_step
+from stages.sfm.worker.sparse_model import camera_centres
+
+NEIGHBOURS = 10
+_NEXT_IN_ORDER = 2  # photographs, which are matched whatever the poses say
+EXHAUSTIVE_UP_TO = 25  # views
+_SAME_PART = 1e-6  # difference of the rotations of two faces in the same direction
+INLIER_RATIO, ROUGH_INLIER_RATIO = 0.5, 0.5  # of the median pair; rough: at four times the distance
+FEWEST_PAIRS = 3
+
+
+def reconstruct(
+    capture: Capture,
+    path: Path,
+    folder: Path,
+    work: Path,
+    report: Report,
+    *,
+    split: bool,
+    refine: bool,
+    allow_partial: bool,
+    seed: int,
+    max_features: int,
+    known_scale: KnownScale,
+    seconds_left: Callable[[], float],
+) -> Reconstruction:
+    """The capture with the cameras in `path`. Writes what `finish.finish` writes.
+
+    Args:
+        capture: the photographs.
+        path: a camera file or folder.
+        folder: of the reconstruction.
+        work: folder for what an interrupted run resumes from.
+        report: receives metrics, warnings and progress.
+        split: see `match_cameras`.
+        refine: refine the poses by bundle adjustment.
+        allow_partial: accept missing cameras and poses that do not fit the matches.
+        seed, max_features: of features and matching.
+        known_scale: what is known of the size of the scene.
+        seconds_left: until the deadline.
+
+    Raises SplatError, and Interrupted.
+    """
+    found = read_cameras(path)
+    from_file = read_points(path)
+    posed = match_cameras(found, capture, split, allow_partial, report)
+    _check_usable(posed, refine)
+    shutil.rmtree(folder / COLMAP, ignore_errors=True)
+    views = write_pinhole_views(posed, capture.folder, folder, report)
+    training = [i for i, view in enumerate(views) if posed[view.number].role != "test"]
+    job = _job([views[i] for i in training], folder, work, seed, max_features, refine)
+    _match(job, work, report, seconds_left)
+    triangulated = Path(job.out) / "points.npz"
+    _check_poses(Path(job.out), report, allow_partial)
+    if refine:
+        views = _refined(views, triangulated, report)
+    cloud, observations = find_points(
+        from_file, triangulated, training, views, _whole(views, posed), folder, seed, report
+    )
+    known_scale = replace(known_scale, georeference=found.georeference)
+    roles = [posed[view.number].role for view in views]
+    return _finish(views, roles, cloud, observations, folder, report, known_scale)
+
+
+def _whole(views: Sequence[PinholeView], posed: Sequence[PosedPhoto]) -> list[Camera]:
+    """[V] one camera for all views of a photograph: of each, the pinhole camera that shows most of
+    what the photograph shows, whose axis is the photograph's."""
+    cameras = []
+    for view in views:
+        camera = view.camera
+        if view.photo.face:
+            taken = posed[view.number]
+            pose = _of_photograph(view)
+            camera = replace(undistorted_camera(taken.camera, taken.lens), world_to_camera=pose)
+        cameras.append(camera)
+    return cameras
+
+
+def _of_photograph(view: PinholeView) -> NDArray[np.float64]:
+    """[4, 4] the pose of the photograph that a view shows a part of."""
+    pose = view.camera.world_to_camera.copy()
+    pose[:3] = view.rotation.T @ pose[:3]
+    return pose
+
+
+def _job(
+    views: Sequence[PinholeView],
+    folder: Path,
+    work: Path,
+    seed: int,
+    max_features: int,
+    refine: bool,
+) -> Job:
+    """The job for the training views, each with a camera of its own. The faces of a photograph are
+    a rig."""
+    photos, chosen = [view.photo for view in views], [view.camera for view in views]
+    photographs = np.unique([view.number for view in views], return_inverse=True)[1]
+    poses = np.array([camera.world_to_camera for camera in chosen])
+    rotations = np.array([view.rotation for view in views])
+    job = Job(
+        step="",
+        images_root=str((folder / IMAGES).resolve()),
+        database=str(work / "known.db"),
+        out=str(work / "known"),
+        names=tuple(photo.picture for photo in photos),
+        masks=tuple(_mask_from_images(photo) for photo in photos),
+        camera_of=tuple(range(len(views))),
+        frame_of=tuple(photographs.tolist()),
+        cameras=tuple(_guess(view) for view in views),
+        seed=seed,
+        threads=threads.count(),
+        max_features=max_features,
+        refine=refine,
+        pairs=tuple(neighbours(poses, rotations, photographs)),
+        known={
+            "intrinsics": [(c.fx, c.fy, c.cx, c.cy) for c in chosen],
+            "world_to_camera": poses.tolist(),
+            "rotations": rotations.tolist(),
+        },
+    )
+    prepare_work_folder(work, job)
+    return job
+
+
+def _guess(view: PinholeView) -> CameraGuess:
+    camera, face = view.camera, view.photo.face
+    rig = (f"{view.number}", tuple(quaternions_of(view.rotation).tolist())) if face else ("", ())
+    return CameraGuess(camera.width, camera.height, (camera.fx * camera.fy) ** 0.5, *rig)
+
+
+def _mask_from_images(photo: Photo) -> str:
+    """Path of a photograph's undistorted mask, relative to the undistorted pictures."""
+    return os.path.relpath(mask_file(photo), IMAGES) if photo.mask else ""
+
+
+def neighbours(
+    poses: NDArray[np.float64], faces: NDArray[np.float64], photographs: NDArray[np.int64]
+) -> list[Pair]:
+    """The pairs to match: each view with those nearest in position and direction, and with the
+    same part of the photographs next in order, in case the poses are wrong. The views of one
+    photograph show different things, and are not matched.
+
+    Args:
+        poses: world-to-camera matrices [V, 4, 4].
+        faces: [V, 3, 3] from each photograph's axes to the camera's.
+        photographs: [V] number of each view's photograph.
+    """
+    count = len(poses)
+    first, second = np.triu_indices(count, 1)
+    apart = photographs[first] != photographs[second]
+    first, second = first[apart], second[apart]
+    if count > EXHAUSTIVE_UP_TO:
+        rotations = poses[:, :3, :3]
+        centres = camera_centres(poses)
+        distance = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+        angle = np.arccos(np.clip(rotations[:, 2] @ rotations[:, 2].T, -1.0, 1.0))
+        cost = distance / max(float(np.median(distance)), 1e-300) + angle
+        cost[photographs[:, None] == photographs[None]] = np.inf
+        near = np.argsort(cost, axis=1, kind="stable")[:, :NEIGHBOURS]
+        selected = np.zeros((count, count), np.bool_)
+        np.put_along_axis(selected, near, True, axis=1)
+        selected |= selected.T
+        alike = np.abs(faces[first] - faces[second]).max(axis=(1, 2)) < _SAME_PART
+        following = photographs[second] - photographs[first] <= _NEXT_IN_ORDER
+        keep = selected[first, second] | (following & alike)
+        first, second = first[keep], second[keep]
+    return list(zip(first.tolist(), second.tolist(), strict=True))
+
+
+def _match(job: Job, work: Path, report: Report, seconds_left: Callable[[], float]) -> None:
+    """Features, matches, and the check of poses and points from matches; skips finished steps."""
+    for step in ("features", "neighbours", "triangulation"):
+        marker = work / f"{step}.done"
+        if not marker.exists():
+            sqlite.repair_or_delete(Path(job.database))
+            run_step(replace(job, step=step), work, report, seconds_left())
+            marker.touch()
+
+
+def _refined(views: Sequence[PinholeView], path: Path, report: Report) -> list[PinholeView]:
+    """The views with refined poses; reports by how much they moved."""
+    poses = np.load(path)["world_to_camera"]
+    cameras = [view.camera for view in views]
+    moved = [replace(c, world_to_camera=p) for c, p in zip(cameras, poses, strict=True)]
+    away = [float(np.linalg.norm(a.centre - b.centre)) for a, b in zip(moved, cameras, strict=True)]
+    before = np.array([camera.world_to_camera for camera in cameras])
+    cosines = np.einsum("vij,vij->v", poses[:, :3, :3], before[:, :3, :3]) / 2 - 0.5
+    angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
+    report.metric("cameras_moved", {"median": float(np.median(away)), "max": max(away)})
+    report.metric(
+        "cameras_turned_deg", {"median": float(np.median(angles)), "max": float(angles.max())}
+    )
+    return [replace(view, camera=camera) for view, camera in zip(views, moved, strict=True)]
+
+
+def _check_poses(out: Path, report: Report, allow_partial: bool) -> None:
+    """Refuse poses that do not fit the matches, and name the likely cause."""
+    found = json.loads((out / "pose_check.json").read_text(encoding="utf-8"))
+    ratio = found["given"]
+    if "refined" in found:
+        report.metric("epipolar_inlier_ratio_before", None if ratio is None else round(ratio, 4))
+        ratio = found["refined"]
+    report.metric("matched_pairs", found["pairs"])
+    report.metric("epipolar_inlier_ratio", None if ratio is None else round(ratio, 4))
+    if ratio is None or found["pairs"] < FEWEST_PAIRS:
+        report.warn(
+            "cameras-unchecked",
+            "Too few photographs match each other to check the cameras: they are used as they are.",
+        )
+        return
+    if ratio >= INLIER_RATIO:
+        return
+    mistake, best = max(found["mistakes"].items(), key=lambda other: other[1] or 0.0)
+    explained = (best or 0.0) >= INLIER_RATIO
+    if not explained and found["rough"] >= ROUGH_INLIER_RATIO:
+        report.warn(
+            "cameras-rough",
+            f"Only {ratio:.0%} of the matches lie within 4 px of 1600 of where the cameras predict "
+            "them, but most lie within 16 px: the cameras are rough, and the result will be "
+            "blurred. --refine-cameras refines their poses.",
+        )
+        return
+    likely = (
+        f"The matches fit ({best:.0%}) if {mistake}"
+        if explained
+        else "Check that the file belongs to these photographs, under these names, uncropped."
+    )
+    error = ReconstructionError(
+        "cameras-do-not-fit",
+        given=f"Only {ratio:.0%} of the matches between two photographs fit the file's cameras.",
+        wanted=f"At least {INLIER_RATIO:.0%}, as cameras of these photographs have.",
+        hint=f"{likely} --allow-partial goes on all the same; with --cameras '' splat finds "
+        "cameras itself.",
+    )
+    if not allow_partial:
+        raise error
+    report.warn(error.code, f"Accepted because of --allow-partial: {error.given} {likely}")
+
+
+def _finish(
+    views: Sequence[PinholeView],
+    roles: Sequence[str],
+    cloud: FilePoints,
+    observations: Observations,
+    folder: Path,
+    report: Report,
+    known_scale: KnownScale,
+) -> Reconstruction:
+    """Level, recentre and scale; write the COLMAP model."""
+    georeference = known_scale.georeference
+    turn, levelled = _levelling(views, georeference.axes)
+    middle = np.median(np.repeat(cloud.points, np.maximum(cloud.tracks, 1), axis=0), axis=0)
+    world_from_new = np.eye(4)
+    world_from_new[:3, :3], world_from_new[:3, 3] = turn.T, middle
+    cameras = [view.camera.moved(world_from_new) for view in views]
+    points = (cloud.points - middle) @ turn.T
+    photos = [view.photo for view in views]
+    pictures = [folder / IMAGES / photo.picture for photo in photos]
+    if georeference.place is not None:
+        place = georeference.place.moved(world_from_new)
+        known_scale = replace(known_scale, georeference=replace(georeference, place=place))
+    scale = find_metric_scale(known_scale, photos, cameras, pictures, levelled, report)
+    if scale is not None:
+        points, cameras = scale.points(points), scale.cameras(cameras)
+        world_from_new[:3, :3] = world_from_new[:3, :3] @ scale.turn.T / scale.metres
+    report.metric("file_from_world", world_from_new.tolist())
+    return write_reconstruction(
+        folder,
+        photos,
+        cameras,
+        replace(cloud, points=points),
+        observations,
+        levelled=levelled,
+        metric=scale,
+        roles=roles,
+    )
+
+
+def _levelling(
+    views: Sequence[PinholeView], axes: NDArray[np.float64] | None
+) -> tuple[NDArray[np.float64], bool]:
+    """(rotation [3, 3] to a world with up = -Y, whether up is known): by the axes of the file, with
+    +Z to the north, or else by how the photographs were held."""
+    if axes is not None:
+        east, north, up = axes
+        return np.stack([east, -up, north]), True
+    photographs = {view.number: _of_photograph(view)[:3, :3] for view in views}
+    rotations = np.array([*photographs.values()])
+    found = up_direction(rotations)
+    if found is None:
+        return np.eye(3), False
+    return levelling_rotation(found, rotations[0, 2], rotations[0, 0]), True
+
+
+def _check_usable(posed: Sequence[PosedPhoto], refine: bool) -> None:
+    if len(posed) < 3:
+        raise SplatError(
+            "sfm-too-few-photographs",
+            given=f"{counted(len(posed), 'photograph')} of the capture have a camera.",
+            wanted="At least 3.",
+            hint="Check that the file's names are those of the photographs.",
+        )
+    if refine and any(one.role == "test" for one in posed):
+        raise UsageError(
+            "cameras-split-and-refined",
+            given="--refine-cameras with --split: refinement moves the training cameras and not "
+            "the test cameras, so the test views would no longer fit.",
+            wanted="One of the two options.",
+            hint="Leave --split away; then every eighth photograph is held out.",
+        )

@@ -1,0 +1,187 @@
+"""Matches and points for known cameras, in the worker process (imports pycolmap)."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from stages.cameras.camera_file import poses_of
+from stages.scene.rotations import similarity
+from stages.sfm.known.epipolar import likely_mistakes, median_inlier_ratio
+from stages.sfm.worker.job import Job
+from stages.sfm.worker.mapping import point_arrays, verified_matches
+from stages.sfm.worker.matching import match_pairs
+from stages.sfm.worker.sparse_model import camera_centres
+
+# Factor on COLMAP's error thresholds of triangulation, for each round of refinement: with the usual
+# thresholds, rough poses give no points to begin with.
+REFINEMENTS = (8.0, 4.0, 2.0, 1.0, 1.0)
+
+
+def match_neighbours(job: Job) -> None:
+    """Match and verify the selected pairs, with the exact intrinsics of the known cameras."""
+    with pycolmap.Database.open(job.database) as database:
+        for camera in _cameras(job):
+            database.update_camera(camera)
+    match_pairs(job, list(job.pairs))
+
+
+def triangulate(job: Job) -> None:
+    """Check the poses against the matches, and triangulate points with the poses held fixed.
+
+    Writes to `job.out`: pose_check.json, inlier ratios of the given poses and of corrections of
+    likely mistakes (see `epipolar`); points.npz, points, observations and poses.
+    """
+    lens, poses, faces = (
+        np.array(job.known[name]) for name in ("intrinsics", "world_to_camera", "rotations")
+    )
+    out = Path(job.out)
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    pairs = _matched_points(Path(job.database))
+    mistakes = _corrected(poses, faces, job.frames)
+    side = float(max(max(camera.width, camera.height) for camera in job.cameras))
+    found = {
+        "pairs": len(pairs),
+        "matches": sum(len(pair[2]) for pair in pairs),
+        "given": median_inlier_ratio(pairs, lens, poses, side),
+        "rough": median_inlier_ratio(pairs, lens, poses, 4.0 * side),
+        "mistakes": {
+            name: median_inlier_ratio(pairs, lens, corrected, side)
+            for name, corrected in mistakes.items()
+        },
+    }
+    if job.refine:
+        poses = _refined(job, poses, out / "colmap")
+        found["refined"] = median_inlier_ratio(pairs, lens, poses, side)
+    (out / "pose_check.json").write_text(json.dumps(found), encoding="utf-8")
+    _save_points(_triangulated(job, poses, out / "colmap"), poses, out / "points.npz")
+
+
+def _corrected(
+    poses: NDArray[np.float64], faces: NDArray[np.float64], photographs: NDArray[np.int64]
+) -> dict[str, NDArray[np.float64]]:
+    """`likely_mistakes` of the photographs' poses, as poses of the views.
+
+    Args:
+        poses: [V, 4, 4] of the views.
+        faces: [V, 3, 3] from the photographs' axes to those of the views.
+        photographs: [V] number of each view's photograph.
+    """
+    turns = np.tile(np.eye(4), (len(faces), 1, 1))
+    turns[:, :3, :3] = faces
+    first = np.unique(photographs, return_index=True)[1]
+    whole = turns[first].transpose(0, 2, 1) @ poses[first]
+    return {name: turns @ fixed[photographs] for name, fixed in likely_mistakes(whole).items()}
+
+
+def _cameras(job: Job) -> Iterator[pycolmap.Camera]:
+    """The camera of each view, with the number of its photograph."""
+    known = zip(job.cameras, job.known["intrinsics"], strict=True)
+    for number, (guess, params) in enumerate(known, 1):
+        size = {"width": guess.width, "height": guess.height}
+        camera = pycolmap.Camera(camera_id=number, model="PINHOLE", params=params, **size)
+        camera.has_prior_focal_length = True
+        yield camera
+
+
+def _matched_points(path: Path) -> list[tuple[int, int, NDArray[np.float64], NDArray[np.float64]]]:
+    """(first, second, pixels in the first [N, 2], in the second) of each pair of
+    `verified_matches`, which does not depend on the given poses."""
+    found = []
+    with pycolmap.Database.open(path) as database:
+        keypoints: dict[int, NDArray[np.float64]] = {}
+        for (first, second), matches in verified_matches(database):
+            for image in (first, second):
+                if image not in keypoints:
+                    keypoints[image] = database.read_keypoints(image)[:, :2].astype(np.float64)
+            a, b = keypoints[first][matches[:, 0]], keypoints[second][matches[:, 1]]
+            found.append((first - 1, second - 1, a, b))
+    return found
+
+
+def _refined(job: Job, given: NDArray[np.float64], scratch: Path) -> NDArray[np.float64]:
+    """[V, 4, 4] the `given` poses after rounds of triangulation and bundle adjustment, with fixed
+    intrinsics.
+
+    Early rounds use wide error thresholds, since the poses are rough. The result is aligned to the
+    given camera centres by a similarity, so that the world stays the given one.
+    """
+    poses = given
+    for slack in REFINEMENTS:
+        model = _triangulated(job, poses, scratch, slack)
+        options = pycolmap.BundleAdjustmentOptions()
+        options.refine_focal_length = options.refine_extra_params = False
+        options.refine_sensor_from_rig = False  # the faces of a photograph lie exactly
+        options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+        options.ceres.solver_options.num_threads = 1
+        options.print_summary = False
+        pycolmap.bundle_adjustment(model, options)
+        poses = given.copy()
+        for number in sorted(model.reg_image_ids()):
+            poses[number - 1, :3] = model.images[number].cam_from_world().matrix()
+    scale, turn, shift = similarity(camera_centres(poses), camera_centres(given))
+    centres = scale * camera_centres(poses) @ turn.T + shift
+    poses[:, :3] = poses_of(poses[:, :3, :3] @ turn.T, centres)
+    return poses
+
+
+def _triangulated(
+    job: Job, poses: NDArray[np.float64], scratch: Path, slack: float = 1.0
+) -> pycolmap.Reconstruction:
+    """Triangulate the matches with fixed poses [V, 4, 4]. slack: factor on COLMAP's error
+    thresholds."""
+    scratch.mkdir()
+    model = _posed(job, poses)
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = 1
+    options.random_seed = options.mapper.random_seed = job.seed
+    triangulation = options.triangulation
+    triangulation.random_seed = job.seed
+    triangulation.create_max_angle_error *= slack
+    triangulation.continue_max_angle_error *= slack
+    triangulation.merge_max_reproj_error *= slack
+    triangulation.complete_max_reproj_error *= slack
+    options.mapper.filter_max_reproj_error *= slack
+    model = pycolmap.triangulate_points(
+        model, job.database, job.images_root, scratch, options=options
+    )
+    model.extract_colors_for_all_images(job.images_root, num_threads=1)
+    model.update_point_3d_errors()
+    shutil.rmtree(scratch)
+    return model
+
+
+def _posed(job: Job, poses: NDArray[np.float64]) -> pycolmap.Reconstruction:
+    """A model of the views, without points, with the rigs and frames of the database. Each view has
+    a camera of its own with the same number."""
+    model = pycolmap.Reconstruction()
+    for camera in _cameras(job):
+        model.add_camera(camera)
+    frame_of: dict[int, int] = {}
+    with pycolmap.Database.open(job.database) as database:
+        for rig in database.read_all_rigs():
+            model.add_rig(rig)
+        for frame in database.read_all_frames():
+            frame_of |= {data.id: frame.frame_id for data in frame.data_ids}
+            frame.rig_from_world = pycolmap.Rigid3d(poses[frame.rig_id - 1, :3])
+            model.add_frame(frame)
+    for number, name in enumerate(job.names, 1):
+        image = pycolmap.Image(name=name, camera_id=number, image_id=number)
+        image.frame_id = frame_of[number]
+        model.add_image(image)
+    for frame_id in sorted(set(frame_of.values())):
+        model.register_frame(frame_id)
+    return model
+
+
+def _save_points(model: pycolmap.Reconstruction, poses: NDArray[np.float64], path: Path) -> None:
+    arrays = point_arrays(model, {i: i - 1 for i in sorted(model.reg_image_ids())})
+    errors = [model.points3D[i].error for i in sorted(model.point3D_ids())]
+    np.savez(path, **arrays, errors_px=np.array(errors, np.float64), world_to_camera=poses)  # type: ignore[arg-type]

@@ -1,0 +1,1 @@
+"""Learned features and matches, for photographs that SIFT leaves out."""

@@ -1,0 +1,1 @@
+"""Where the scene is: levelling, metric scale, GPS, coordinate systems, markers."""

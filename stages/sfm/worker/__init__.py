@@ -1,0 +1,1 @@
+"""The worker process, which alone imports COLMAP: features, pairs, matches, mapping."""

@@ -1,0 +1,47 @@
+"""`python -m stages.sfm.worker.__main__ job.json`: one step of structure from motion.
+
+COLMAP aborts the process on some inputs, and importing it before zlib corrupts the heap if Python
+links the system's zlib. In a separate process neither can end a run.
+"""
+
+import zlib  # noqa: F401, I001 - must come before pycolmap: see above
+
+import sys
+from pathlib import Path
+
+from stages.base.parent import die_with_parent
+from stages.sfm.worker.job import Job
+
+
+def main(arguments: list[str]) -> int:
+    """Run the job named on the command line. Returns the exit status (0: done)."""
+    die_with_parent()
+    job = Job.read(Path(arguments[0]))
+    from stages.sfm.known import worker as known_cameras_worker
+    from stages.sfm.worker import features, mapping, matching
+
+    steps = {
+        "features": features.extract_features,
+        "matching": matching.match_all,
+        "mapping": mapping.map_photographs,
+        # with known cameras
+        "neighbours": known_cameras_worker.match_neighbours,
+        "triangulation": known_cameras_worker.triangulate,
+        # with an executor
+        "pair selection": matching.select_pairs,
+        "features chunk": features.extract_chunk,
+        "matching chunk": matching.match_chunk,
+        "learned": _match_learned,
+    }
+    steps[job.step](job)
+    return 0
+
+
+def _match_learned(job: Job) -> None:
+    from stages.sfm.learned import joining as learned  # imports torch, which takes seconds
+
+    learned.match_learned(job)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

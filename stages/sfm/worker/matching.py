@@ -1,0 +1,244 @@
+"""Matches of pairs of photographs, verified, in the worker process (imports pycolmap)."""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from stages.base.atomic import replacing
+from stages.sfm.worker import database as sqlite
+from stages.sfm.worker import new_database, pairs, retrieval
+from stages.sfm.worker.descriptor_matching import match_descriptors
+from stages.sfm.worker.job import (
+    Job,
+    ProgressWriter,
+    chunks_path,
+    selected_pairs_path,
+    similarity_path,
+    vocabulary_path,
+)
+from stages.sfm.worker.pairs import Pair
+from stages.sfm.worker.vocabulary import (
+    SAMPLED_DESCRIPTORS,
+    FeatureIndex,
+    build_vocabulary,
+    index_by_word,
+    word_pairs,
+)
+
+LARGEST_FEATURES = 1000  # compared for pair selection; they are seen from the farthest
+FEWEST_COMPARED_SMALL = 64  # as `vocabulary.FEWEST_COMPARED`, for pair selection: it may err more
+FEWEST_INLIERS = 15  # as in COLMAP
+MOST_TRIALS = 3000  # of RANSAC, for pairs with few inliers
+_CACHED = 256  # photographs whose feature indices stay in memory
+
+
+def match_all(job: Job) -> None:
+    """Match and verify pairs of photographs, except those that the database holds."""
+    with _matcher(job, job.database) as matcher:
+        for wanted in _rounds(job, matcher.features, matcher.inliers):
+            matcher.run(wanted)
+
+
+def match_pairs(job: Job, wanted: list[Pair]) -> None:
+    """Match and verify the `wanted` pairs, except those that the database holds."""
+    with _matcher(job, job.database) as matcher:
+        matcher.run(wanted)
+
+
+def select_pairs(job: Job) -> None:
+    """Merge finished chunks, and write the pairs to match next (`selected_pairs_path`): none once
+    `match_all` would find nothing to do."""
+    database = Path(job.database)
+    sqlite.merge_chunks(database, sorted(chunks_path(job).glob("*.db")))
+    inliers = sqlite.inliers_of_pairs(database)
+    missing: list[Pair] = []
+    with closing(sqlite.StoredFeatures(database)) as stored:
+        features = _IndexedFeatures(job, stored)
+        features.vocabulary()  # built once, and not in each chunk
+        for wanted in _rounds(job, features, inliers):
+            missing = [pair for pair in wanted if pair not in inliers]
+            if missing:
+                break
+    selected_pairs_path(job).write_text(json.dumps(missing))
+
+
+def match_chunk(job: Job) -> None:
+    """Match and verify the pairs of the job's chunk, into a database of its own."""
+    new_database.create(Path(job.database), job, ())
+    with _matcher(job, job.source, immutable=True) as matcher:
+        matcher.run(list(job.pairs))
+
+
+@contextmanager
+def _matcher(job: Job, source: str, immutable: bool = False) -> Iterator[_Matcher]:
+    """A matcher with features from the database `source`; immutable: as in
+    `database.StoredFeatures`. Its reader is closed before the writer, because the last to close a
+    database tidies it up."""
+    with (
+        pycolmap.Database.open(job.database) as database,
+        closing(sqlite.StoredFeatures(Path(source), immutable)) as stored,
+    ):
+        yield _Matcher(job, database, stored)
+
+
+def _rounds(
+    job: Job, features: _IndexedFeatures, inliers: Mapping[Pair, int]
+) -> Iterator[list[Pair]]:
+    """Lists of pairs to match, each selected when the one before is matched. inliers: of the pairs
+    that are matched."""
+    frames = job.frames
+    if job.matching == "exhaustive":
+        yield pairs.pairs_of_faces(pairs.exhaustive_pairs(int(frames.max()) + 1), frames)
+    elif job.matching == "sequential":
+        yield pairs.pairs_of_faces(pairs.sequential_pairs(int(frames.max()) + 1), frames)
+    else:
+        similarity = _similarity(job, features)
+        first = [(i, j) for i, j in pairs.initial_pairs(similarity) if frames[i] != frames[j]]
+        yield first
+        known = {pair: inliers[pair] for pair in first}
+        yield pairs.linking_pairs(similarity, first, known, frames)
+
+
+class _IndexedFeatures:
+    """Features of photographs by position, indexed by visual word; for several threads."""
+
+    def __init__(self, job: Job, stored: sqlite.StoredFeatures) -> None:
+        self._job, self._stored = job, stored
+        self.vocabulary = functools.cache(self._vocabulary)
+        self.index = functools.lru_cache(_CACHED)(self._index)
+        self.points = functools.lru_cache(_CACHED)(stored.points)
+
+    def _vocabulary(self) -> NDArray[np.float32]:
+        """Of all photographs; stored beside the database, for chunks and resumed runs."""
+        path, photographs = vocabulary_path(self._job), len(self._job.names)
+        if not path.exists():
+            progress = ProgressWriter(self._job)
+            most = max(1, SAMPLED_DESCRIPTORS // photographs)
+            rows = []
+            for i in range(photographs):
+                descriptors = self._stored.descriptors(i)
+                rows.append(descriptors[:: max(1, len(descriptors) // most)][:most])
+                progress.write("indexing features", i + 1, 2 * photographs)
+            with replacing(path) as partial:
+                np.save(partial, build_vocabulary(np.concatenate(rows)))
+        found: NDArray[np.float32] = np.load(path)
+        return found
+
+    def largest(self, position: int) -> tuple[FeatureIndex, NDArray[np.int64]]:
+        """For pair selection: the largest features, and their words for retrieval."""
+        first, words = self._stored.descriptors(position)[:LARGEST_FEATURES], self.vocabulary()
+        return index_by_word(first, words, FEWEST_COMPARED_SMALL), word_pairs(first, words)
+
+    def _index(self, position: int) -> FeatureIndex:
+        return index_by_word(self._stored.descriptors(position), self.vocabulary())
+
+
+class _Matcher:
+    """Matches and verifies pairs in several threads, and writes the results. inliers: of the pairs
+    that are matched."""
+
+    def __init__(
+        self, job: Job, database: pycolmap.Database, stored: sqlite.StoredFeatures
+    ) -> None:
+        self.features = _IndexedFeatures(job, stored)
+        self.inliers = sqlite.inliers_of_pairs(Path(job.database))
+        self._job, self._database, self._stored = job, database, stored
+        self._cameras = [database.read_camera(camera + 1) for camera in job.camera_of]
+        self._progress = ProgressWriter(job)
+
+    def run(self, wanted: list[Pair]) -> None:
+        """Match the `wanted` pairs, except those that are matched."""
+        missing = [pair for pair in wanted if pair not in self.inliers]
+        done = len(wanted) - len(missing)
+        self.features.vocabulary()  # now, and not in several threads at once
+        with ThreadPoolExecutor(self._job.threads) as pool:
+            for pair, (matches, geometry) in zip(
+                missing, pool.map(self._match, missing), strict=True
+            ):
+                first, second = pair[0] + 1, pair[1] + 1
+                if matches is not None:
+                    self._database.write_matches(first, second, matches)
+                self._database.write_two_view_geometry(first, second, geometry)
+                self.inliers[pair] = len(geometry.inlier_matches)
+                done += 1
+                self._progress.write("matching", done, len(wanted))
+
+    def _match(self, pair: Pair) -> tuple[NDArray[np.uint32] | None, pycolmap.TwoViewGeometry]:
+        """(matches; None if the database has them, two-view geometry; without inliers if it has too
+        few)."""
+        first, second = pair
+        known = self._stored.matches(first, second)
+        matches = known
+        if matches is None:
+            matches = match_descriptors(self.features.index(first), self.features.index(second))
+        sides = [(self._cameras[position], self.features.points(position)) for position in pair]
+        geometry = two_view_geometry(sides[0], sides[1], matches, self._job)
+        return (matches if known is None else None), geometry
+
+
+def _similarity(job: Job, features: _IndexedFeatures) -> NDArray[np.int32]:
+    """[P, P] matches among the largest features of the pairs that retrieval proposes; 0 for others.
+    Stored for resumed runs."""
+    photographs, stored = len(job.names), similarity_path(job)
+    if stored.exists():
+        found: NDArray[np.int32] = np.load(stored)["similarity"]
+        return found
+    features.vocabulary()
+    progress = ProgressWriter(job)
+    similarity = np.zeros((photographs, photographs), np.int32)
+    indices, words_of = [], []
+    with ThreadPoolExecutor(job.threads) as pool:
+        for done, (index, words) in enumerate(pool.map(features.largest, range(photographs)), 1):
+            indices.append(index)
+            words_of.append(words)
+            progress.write("indexing features", photographs + done, 2 * photographs)
+        wanted = retrieval.candidate_pairs(
+            words_of, lambda done: progress.write("retrieving pairs", done, photographs)
+        )
+        wanted = [(i, j) for i, j in wanted if job.frames[i] != job.frames[j]]
+
+        def count_matches(pair: Pair) -> int:
+            return len(match_descriptors(indices[pair[0]], indices[pair[1]]))
+
+        counts = pool.map(count_matches, wanted)
+        for done, (pair, count) in enumerate(zip(wanted, counts, strict=True), 1):
+            similarity[pair] = count
+            progress.write("selecting pairs", done, len(wanted))
+    similarity += similarity.T
+    with replacing(stored) as partial:
+        np.savez_compressed(partial, similarity=similarity)
+    return similarity
+
+
+def two_view_geometry(
+    first: tuple[pycolmap.Camera, NDArray[np.float64]],
+    second: tuple[pycolmap.Camera, NDArray[np.float64]],
+    matches: NDArray[np.uint32],
+    job: Job,
+) -> pycolmap.TwoViewGeometry:
+    """The two-view geometry of two photographs; without inliers if it has too few.
+
+    Args:
+        first, second: the camera of a photograph and its keypoints [N, 2].
+        matches: [M, 2] indices of keypoints.
+        job: its seed, and whether stationary matches are dropped.
+    """
+    nothing = pycolmap.TwoViewGeometry()
+    if len(matches) < FEWEST_INLIERS:
+        return nothing
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = job.seed
+    options.ransac.max_num_trials = MOST_TRIALS
+    options.compute_relative_pose = True  # also tells a pure rotation from a planar scene
+    options.filter_stationary_matches = job.drop_stationary
+    found = pycolmap.estimate_two_view_geometry(*first, *second, matches, options)
+    return found if len(found.inlier_matches) >= FEWEST_INLIERS else nothing

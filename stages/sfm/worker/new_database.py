@@ -1,0 +1,79 @@
+"""A new COLMAP database with cameras and photographs (imports pycolmap)."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Sequence
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from stages.scene.rotations import matrices_of
+from stages.sfm.worker import database as sqlite
+from stages.sfm.worker.job import CameraGuess, Job
+
+FOCAL_WITHOUT_PRIOR = 1.2  # x the longer side: COLMAP's guess without EXIF
+
+
+def create(path: Path, job: Job, only: Collection[int] | None = None) -> None:
+    """Write a database with cameras and photographs, ids = position + 1; it appears at `path` when
+    it is complete. only: positions of the photographs to write, by default all.
+
+    COLMAP's own import would trust EXIF focal lengths that are wrong after resizing.
+    """
+    partial = path.with_name(path.name + ".partial")
+    sqlite.delete(partial)
+    database = pycolmap.Database.open(partial)
+    rig_of = _write_rigs(database, job.cameras)
+    frames: dict[int, pycolmap.Frame] = {}
+    for image_id, (name, position) in enumerate(zip(job.names, job.camera_of, strict=True), 1):
+        if only is not None and image_id - 1 not in only:
+            continue
+        image = pycolmap.Image()
+        image.image_id = image_id
+        image.name = name
+        image.camera_id = position + 1
+        database.write_image(image, use_image_id=True)
+        frame_id = int(job.frames[image_id - 1]) + 1
+        frame = frames.setdefault(frame_id, pycolmap.Frame())
+        frame.frame_id = frame_id
+        frame.rig_id = rig_of[position]
+        frame.add_data_id(image.data_id)
+    for frame in frames.values():
+        database.write_frame(frame, use_frame_id=True)
+    database.close()
+    os.replace(partial, path)
+
+
+def _write_rigs(database: pycolmap.Database, cameras: Sequence[CameraGuess]) -> list[int]:
+    """Write cameras and rigs; returns the id of each camera's rig: its own id, or that of the first
+    camera of a panorama's rig, which is the rig's reference."""
+    rig_of: list[int] = []
+    first: dict[str, int] = {}
+    rigs: dict[int, pycolmap.Rig] = {}
+    for camera_id, guess in enumerate(cameras, 1):
+        rig_id = first.setdefault(guess.rig, camera_id) if guess.rig else camera_id
+        rig_of.append(rig_id)
+        camera = _camera(camera_id, guess)
+        database.write_camera(camera, use_camera_id=True)
+        rig = rigs.setdefault(rig_id, pycolmap.Rig())
+        if rig_id == camera_id:
+            rig.rig_id = rig_id
+            rig.add_ref_sensor(camera.sensor_id)
+        else:
+            turn, reference = (matrices_of(np.array(c.turn)) for c in (guess, cameras[rig_id - 1]))
+            relative = pycolmap.Rotation3d(turn @ reference.T)
+            rig.add_sensor(camera.sensor_id, pycolmap.Rigid3d(relative, np.zeros(3)))
+    for rig in rigs.values():
+        database.write_rig(rig, use_rig_id=True)
+    return rig_of
+
+
+def _camera(camera_id: int, guess: CameraGuess) -> pycolmap.Camera:
+    focal_px = guess.focal_px or FOCAL_WITHOUT_PRIOR * max(guess.width, guess.height)
+    camera = pycolmap.Camera.create_from_model_name(
+        camera_id, "SIMPLE_RADIAL", focal_px, guess.width, guess.height
+    )
+    camera.has_prior_focal_length = guess.focal_px is not None
+    return camera

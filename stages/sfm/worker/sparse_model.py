@@ -1,0 +1,348 @@
+"""A sparse model as plain arrays, written by the worker process, and its statistics.
+
+Also: connectivity of a model: its weakest cut in the graph of photographs that share points.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from stages.scene.capture import PHOTOS_FOLDER
+from stages.sfm.checks.gates import THRESHOLDS, ModelStatistics
+
+_SMALLEST_PART = 0.1  # of the photographs; a few outer ones may be weakly connected
+
+
+def weakest_cut(
+    points: NDArray[np.integer], views: NDArray[np.integer], photographs: int, fewest: int = 3
+) -> tuple[int, tuple[int, ...]]:
+    """(points observed in both parts, photographs of the smaller part) of the cut with the fewest
+    points in common, among cuts along the second eigenvector of the
+    normalised Laplacian of the view graph (Fiedler 1973; Shi and Malik 2000).
+
+    Args:
+        points, views: [O] observations.
+        photographs: of the model.
+        fewest: photographs of the smaller part, at least; and at least a tenth of all.
+
+    If the model is too small to be cut: all points, and no views.
+    """
+    count = int(points.max(initial=-1)) + 1
+    smallest = max(fewest, round(_SMALLEST_PART * photographs))
+    if photographs < 2 * smallest:
+        return count, ()
+    shared = _shared(points, views, photographs)
+    root = 1.0 / np.sqrt(np.maximum(shared.sum(axis=1), 1e-9))
+    order = np.argsort(np.linalg.eigh(-root[:, None] * shared * root)[1][:, 1] * root)
+    rank = np.empty(photographs, np.int64)
+    rank[order] = np.arange(photographs)
+    first, last = np.full(count, photographs), np.full(count, -1)
+    np.minimum.at(first, points, rank[views])
+    np.maximum.at(last, points, rank[views])
+    observed = last >= 0
+    change = np.bincount(first[observed], minlength=photographs).astype(np.int64)
+    change -= np.bincount(last[observed], minlength=photographs)
+    shared_points = np.cumsum(change)[smallest - 1 : photographs - smallest]
+    cut = smallest + int(shared_points.argmin())
+    part = order[:cut] if 2 * cut <= photographs else order[cut:]
+    return int(shared_points.min()), tuple(sorted(part.tolist()))
+
+
+def _shared(
+    points: NDArray[np.integer], views: NDArray[np.integer], photographs: int
+) -> NDArray[np.float64]:
+    """[V, V] number of points that two photographs both observe."""
+    shape = (photographs, int(points.max(initial=-1)) + 1)
+    observes = csr_array((np.ones(len(points), np.bool_), (views, points)), shape).astype(
+        np.float64
+    )
+    shared = np.asarray((observes @ observes.T).todense())
+    np.fill_diagonal(shared, 0.0)
+    return shared
+
+
+_SAMPLED_POINTS = 4000  # every pair of rays of a point is compared, so a sample must do
+_SAMPLED_RAYS = 24
+FEWEST_OBSERVATIONS = 15
+IMPLAUSIBLE_SHARE = 0.1  # of the photographs
+CONSISTENT_RATIO = 0.25  # of a pair's matches: good models have 0.9 and more, false ones 0.05
+
+
+@dataclass(frozen=True)
+class SparseModel:
+    """V registered photographs, C cameras, P points, O observations, Q verified pairs.
+
+    Args:
+        names: [V].
+        view_cameras: [V] index of each photograph's camera.
+        view_frames: [V] number of each photograph's frame: the faces of a panorama share one.
+        world_to_camera: [V, 4, 4].
+        camera_sizes: [C, 2] width, height.
+        camera_params: [C, 4] f, cx, cy, k of COLMAP's SIMPLE_RADIAL: x = f (1 + k r^2) u + cx with
+            u = X / Z, r^2 = u^2 + v^2; pixels, pixel centres at +0.5.
+        focal_priors_px: [C], NaN without EXIF.
+        points: [P, 3].
+        colours: [P, 3] uint8.
+        observed_points, observing_views, observed_px: [O], [O], [O, 2]; sorted by point, then view.
+        pairs: [Q, 2] indices of photographs that share many matches.
+        pair_inlier_ratios: [Q] share of those matches that fits the poses of the model.
+        pairs_turned: [Q] whether the other matches of a pair show the scene turned, as those of
+            several other pairs do.
+        rotations_to_others_deg: [M] for each smaller model with photographs in common: the largest
+            disagreement about their relative rotations.
+    """
+
+    names: tuple[str, ...]
+    view_cameras: NDArray[np.int32]
+    view_frames: NDArray[np.int32]
+    world_to_camera: NDArray[np.float64]
+    camera_sizes: NDArray[np.int32]
+    camera_params: NDArray[np.float64]
+    focal_priors_px: NDArray[np.float64]
+    points: NDArray[np.float64]
+    colours: NDArray[np.uint8]
+    observed_points: NDArray[np.int32]
+    observing_views: NDArray[np.int32]
+    observed_px: NDArray[np.float64]
+    pairs: NDArray[np.int32]
+    pair_inlier_ratios: NDArray[np.float64]
+    pairs_turned: NDArray[np.bool_]
+    rotations_to_others_deg: NDArray[np.float64]
+
+    @property
+    def centres(self) -> NDArray[np.float64]:
+        """[V, 3] camera positions."""
+        return camera_centres(self.world_to_camera)
+
+    @property
+    def tracks(self) -> NDArray[np.int32]:
+        """[P] photographs that observe each point (COLMAP may list one twice in a track)."""
+        first = np.ones(len(self.observed_points), np.bool_)
+        first[1:] = (np.diff(self.observed_points) != 0) | (np.diff(self.observing_views) != 0)
+        seen = self.observed_points[first]
+        return np.bincount(seen, minlength=len(self.points)).astype(np.int32)
+
+
+def camera_centres(world_to_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[V, 3] positions of cameras [V, 4, 4]."""
+    rotations, translations = world_to_camera[:, :3, :3], world_to_camera[:, :3, 3]
+    return np.asarray(-np.einsum("vij,vi->vj", rotations, translations))
+
+
+@dataclass(frozen=True)
+class MappingResult:
+    """model: the largest, or None. groups: names in each model found, largest first. timed_out:
+    whether the mapper ran out of time."""
+
+    model: SparseModel | None = None
+    groups: tuple[tuple[str, ...], ...] = ()
+    timed_out: bool = False
+
+
+def save_model(
+    folder: Path, model: SparseModel | None, *, groups: list[list[str]], timed_out: bool
+) -> None:
+    """Write a mapping's result; the folder appears when it is complete."""
+    partial = folder.with_name(folder.name + ".partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    arrays = {} if model is None else vars(model) | {"names": np.array(model.names)}
+    np.savez(partial / "model.npz", **arrays)
+    result = {"groups": groups, "timed_out": timed_out}
+    (partial / "result.json").write_text(json.dumps(result), encoding="utf-8")
+    shutil.rmtree(folder, ignore_errors=True)
+    os.replace(partial, folder)
+
+
+def load_result(folder: Path) -> MappingResult:
+    """What `save_model` wrote. Raises OSError, ValueError or BadZipFile if it is missing
+    or damaged."""
+    result = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+    arrays = dict(np.load(folder / "model.npz"))
+    model = SparseModel(**arrays | {"names": tuple(arrays["names"].tolist())}) if arrays else None
+    groups = tuple(tuple(group) for group in result["groups"])
+    return MappingResult(model=model, groups=groups, timed_out=bool(result["timed_out"]))
+
+
+def without_implausible_views(model: SparseModel) -> SparseModel:
+    """The model without photographs whose poses are unreliable: those that observe fewer than 15
+    points, and those with implausible intrinsics. The latter stay if they are more than a tenth:
+    then the whole model is implausible, and the gates must refuse it."""
+    frames = model.view_frames
+    seen = np.bincount(frames[model.observing_views], minlength=int(frames.max()) + 1)
+    keep = seen[frames] >= FEWEST_OBSERVATIONS
+    with np.errstate(invalid="ignore"):
+        zoom = np.abs(np.log(model.camera_params[:, 0] / model.focal_priors_px))
+        implausible = (np.abs(model.camera_params[:, 3]) > THRESHOLDS.distortion) | (
+            zoom > np.log(THRESHOLDS.focal_ratio)
+        )
+    views = implausible[model.view_cameras]
+    if views.mean() <= IMPLAUSIBLE_SHARE:
+        keep &= ~views
+    return model if keep.all() else _with_views(model, keep)
+
+
+def _with_views(model: SparseModel, keep_view: NDArray[np.bool_]) -> SparseModel:
+    """The model of some of its views; drops points with fewer than two observations in these, and
+    cameras without a view."""
+    kept = keep_view[model.observing_views]
+    tracks = np.bincount(model.observed_points[kept], minlength=len(model.points))
+    keep_point = tracks >= 2
+    kept &= keep_point[model.observed_points]
+    new_view = np.cumsum(keep_view, dtype=np.int32) - 1
+    new_point = np.cumsum(keep_point, dtype=np.int32) - 1
+    keep_camera = np.zeros(len(model.camera_params), np.bool_)
+    keep_camera[model.view_cameras[keep_view]] = True
+    new_camera = np.cumsum(keep_camera, dtype=np.int32) - 1
+    pairs = keep_view[model.pairs].all(axis=1)
+    return replace(
+        model,
+        names=tuple(name for name, keep in zip(model.names, keep_view, strict=True) if keep),
+        view_cameras=new_camera[model.view_cameras[keep_view]].astype(np.int32),
+        camera_sizes=model.camera_sizes[keep_camera],
+        camera_params=model.camera_params[keep_camera],
+        focal_priors_px=model.focal_priors_px[keep_camera],
+        view_frames=model.view_frames[keep_view],
+        world_to_camera=model.world_to_camera[keep_view],
+        points=model.points[keep_point],
+        colours=model.colours[keep_point],
+        observed_points=new_point[model.observed_points[kept]].astype(np.int32),
+        observing_views=new_view[model.observing_views[kept]].astype(np.int32),
+        observed_px=model.observed_px[kept],
+        pairs=new_view[model.pairs[pairs]].astype(np.int32),
+        pair_inlier_ratios=model.pair_inlier_ratios[pairs],
+        pairs_turned=model.pairs_turned[pairs],
+    )
+
+
+def reprojection_errors(model: SparseModel) -> NDArray[np.float64]:
+    """[O] distance in pixels between each observation and its point's projection."""
+    poses = model.world_to_camera[model.observing_views]
+    xyz = np.einsum("oij,oj->oi", poses[:, :3, :3], model.points[model.observed_points])
+    xyz += poses[:, :3, 3]
+    params = model.camera_params[model.view_cameras[model.observing_views]]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        uv = xyz[:, :2] / xyz[:, 2:]
+        factor = params[:, :1] * (1.0 + params[:, 3:] * np.sum(uv**2, axis=1, keepdims=True))
+        errors = np.linalg.norm(uv * factor + params[:, 1:3] - model.observed_px, axis=1)
+    return np.where(xyz[:, 2] > 0, errors, np.inf)
+
+
+def point_errors(model: SparseModel) -> NDArray[np.float64]:
+    """[P] mean reprojection error of each point, pixels (infinite without observations)."""
+    total = np.bincount(
+        model.observed_points, weights=reprojection_errors(model), minlength=len(model.points)
+    )
+    count = np.bincount(model.observed_points, minlength=len(model.points))
+    return np.where(count > 0, total / np.maximum(count, 1), np.inf)
+
+
+def triangulation_angles(model: SparseModel, index: NDArray[np.integer]) -> NDArray[np.float64]:
+    """[len(index)] largest angle, in degrees, between the rays of two photographs to each point."""
+    starts = np.searchsorted(model.observed_points, np.arange(len(model.points) + 1))
+    centres = model.centres
+    angles = np.zeros(len(index))
+    for i, point in enumerate(index):
+        views = model.observing_views[starts[point] : starts[point + 1]]
+        if len(views) < 2:
+            continue
+        step = -(-len(views) // _SAMPLED_RAYS)
+        rays = centres[views[::step]] - model.points[point]
+        lengths = np.linalg.norm(rays, axis=1, keepdims=True)
+        rays = rays / np.maximum(lengths, 1e-300)
+        angles[i] = np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0)))
+    return angles
+
+
+def baseline_over_depth(model: SparseModel) -> float:
+    """Spread of the cameras (twice the 90th percentile of distances from their median position)
+    over the median distance from a camera to a point that it observes."""
+    if not len(model.observed_points):
+        return 0.0
+    centres = model.centres
+    spread = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
+    rays = model.points[model.observed_points] - centres[model.observing_views]
+    depth = float(np.median(np.linalg.norm(rays, axis=1)))
+    return 2.0 * float(np.percentile(spread, 90)) / max(depth, 1e-300)
+
+
+def flatness(points: NDArray[np.float64]) -> float:
+    """Standard deviation of points [P, 3] across their best plane over the smaller one within it;
+    the tenth of the points that is farthest from their median is left out."""
+    away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    core = points[away <= np.percentile(away, 90)]
+    variances = np.linalg.eigvalsh(np.cov(core.T))
+    return float(np.sqrt(max(variances[0], 0.0) / max(variances[1], 1e-300)))
+
+
+def sideways_share(model: SparseModel) -> float:
+    """Motion of the cameras from their median position: RMS of its part across each optical axis,
+    over RMS of the whole."""
+    moved = model.centres - np.median(model.centres, axis=0)
+    along = np.einsum("vi,vi->v", moved, model.world_to_camera[:, 2, :3])
+    whole = float((moved**2).sum())
+    return float(np.sqrt(max(0.0, 1.0 - (along**2).sum() / whole))) if whole else 0.0
+
+
+def model_statistics(result: MappingResult, photographs: int) -> ModelStatistics:
+    """The statistics that the gates check. photographs: how many were given. The faces of a
+    panorama count as one."""
+    model = result.model
+    sizes = tuple(len(group) for group in result.groups)
+    if model is None or not model.names:
+        return ModelStatistics(photographs=photographs, models=sizes, timed_out=result.timed_out)
+    sample = np.arange(0, len(model.points), max(1, len(model.points) // _SAMPLED_POINTS))
+    angles = triangulation_angles(model, sample)
+    errors = point_errors(model)
+    misfit = model.pair_inlier_ratios < CONSISTENT_RATIO
+    inconsistent = np.flatnonzero(misfit | model.pairs_turned)
+    registered, frames = np.unique(model.view_frames, return_inverse=True)
+    cut_points, part = weakest_cut(
+        model.observed_points, frames[model.observing_views], len(registered)
+    )
+    return ModelStatistics(
+        photographs=photographs,
+        registered=len(registered),
+        models=sizes,
+        timed_out=result.timed_out,
+        points=len(model.points),
+        mean_reprojection_error_px=float(errors.mean()) if len(errors) else 0.0,
+        long_side_px=int(model.camera_sizes.max()),
+        mean_track_length=float(model.tracks.mean()) if len(model.points) else 0.0,
+        median_triangulation_angle_deg=float(np.median(angles)) if len(angles) else 0.0,
+        baseline_over_depth=baseline_over_depth(model),
+        flatness=flatness(model.points) if len(model.points) > 3 else 1.0,
+        sideways_share=sideways_share(model),
+        distortion=_largest(model.camera_params[:, 3]),
+        focal_over_prior=_focal_over_prior(model),
+        pairs_checked=len(model.pairs),
+        pairs_inconsistent=len(inconsistent),
+        pairs_turned=len(inconsistent) - int(misfit.sum()),
+        inconsistent_pair=_names(model, model.pairs[inconsistent[0]]) if len(inconsistent) else (),
+        rotation_to_other_deg=float(model.rotations_to_others_deg.max(initial=0.0)),
+        cut_points=cut_points,
+        cut_views=len(part),
+    )
+
+
+def _names(model: SparseModel, views: NDArray[np.integer]) -> tuple[str, ...]:
+    return tuple(model.names[view].removeprefix(PHOTOS_FOLDER) for view in views)
+
+
+def _largest(values: NDArray[np.float64]) -> float:
+    return float(values[np.argmax(np.abs(values))]) if len(values) else 0.0
+
+
+def _focal_over_prior(model: SparseModel) -> float | None:
+    """The ratio that is farthest from 1, or None without priors."""
+    ratios = model.camera_params[:, 0] / model.focal_priors_px
+    ratios = ratios[np.isfinite(ratios)]
+    return float(ratios[np.argmax(np.abs(np.log(ratios)))]) if len(ratios) else None

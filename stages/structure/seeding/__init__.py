@@ -1,1 +1,0 @@
-"""Initial splats besides those at the sparse points."""

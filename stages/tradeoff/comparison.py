@@ -1,0 +1,192 @@
+"""Two runs of the same photographs, compared view by view: `report.html` and `compare.csv`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from stages.base.atomic import write_csv
+from stages.base.errors import UsageError
+from stages.base.text import counted
+from stages.evaluate.evaluation import (
+    SIZES,
+    EvaluationView,
+    Score,
+    evaluate_at_sizes,
+    image_renderer,
+    load_evaluation_views,
+)
+from stages.scene import Reconstruction, Splats, View, split_held_out
+from stages.tradeoff import html
+from stages.tradeoff.bootstrap import Difference, paired_difference
+from stages.tradeoff.curves import mean_db, psnr_change
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One of the two runs. facts: further lines of the report, text by name."""
+
+    name: str
+    splats: Splats
+    reconstruction: Reconstruction
+    backend: str
+    facts: dict[str, str]
+
+    @property
+    def held_out(self) -> dict[str, View]:
+        """The held-out views of this run by name."""
+        return {view.name: view for view in split_held_out(self.reconstruction.views)[1]}
+
+    def side_px(self, name: str) -> int:
+        """Longer side of the held-out view `name`, as this run draws it."""
+        camera = self.splats.draw_settings.camera(self.held_out[name].camera)
+        return max(camera.width, camera.height)
+
+    def views(self, names: Sequence[str], side_px: int) -> tuple[EvaluationView, ...]:
+        """The held-out views `names` with this run's cameras. Raises SplatError."""
+        held_out, settings = self.held_out, replace(self.splats.draw_settings, side=side_px)
+        chosen = [held_out[name] for name in names]
+        return tuple(load_evaluation_views(self.reconstruction.folder, chosen, settings))
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two candidates on the same held-out views.
+
+    Args:
+        candidates: the first and the second.
+        views: of each, in the same order.
+        by_size: the scores of each, in that order, at each of `SIZES`.
+        psnr, ssim: of the second less the first, at the full size.
+        psnr_by_size: the same at each of `SIZES`.
+        side_px: longer side of every picture at the full size.
+    """
+
+    candidates: tuple[Candidate, Candidate]
+    views: tuple[tuple[EvaluationView, ...], tuple[EvaluationView, ...]]
+    by_size: tuple[dict[str, list[Score]], dict[str, list[Score]]]
+    ssim: Difference
+    psnr_by_size: dict[str, Difference]
+    side_px: int
+
+    @property
+    def psnr(self) -> Difference:
+        return self.psnr_by_size["full"]
+
+    @property
+    def scores(self) -> tuple[list[Score], list[Score]]:
+        """Of each, at the full size."""
+        first, second = self.by_size
+        return first["full"], second["full"]
+
+
+def compare_runs(first: Candidate, second: Candidate) -> Comparison:
+    """Evaluate both on the views that both hold out, at the smaller size of the two, each with its
+    own run's camera. Raises SplatError (compare-nothing-in-common)."""
+    names = sorted(first.held_out.keys() & second.held_out.keys())
+    if not names:
+        raise UsageError(
+            "compare-nothing-in-common",
+            given=f"No photograph is held out of both {first.name} and {second.name}.",
+            wanted="Photographs that neither run was trained on, to compare them by.",
+            hint="Make both runs of the same photographs, four or more.",
+        )
+    both = (first, second)
+    side_px = min(one.side_px(name) for one in both for name in names)
+    views = (first.views(names, side_px), second.views(names, side_px))
+    a, b = (
+        evaluate_at_sizes(image_renderer(one.splats, one.backend), seen)
+        for one, seen in zip(both, views, strict=True)
+    )
+    ssim = np.array([two.ssim - one.ssim for one, two in zip(a["full"], b["full"], strict=True)])
+    psnr = {size: psnr_change(b[size], a[size]) for size in SIZES}
+    return Comparison(both, views, (a, b), paired_difference(ssim), psnr, side_px)
+
+
+def verdict_lines(comparison: Comparison) -> list[str]:
+    """Whether the second candidate is better, and how sure that is."""
+    change, (a, b) = comparison.psnr, comparison.candidates
+    return [
+        f"{b.name} against {a.name}: {_in_words(change, 2, ' dB')}",
+        *(
+            f"At {size} size: {_in_words(comparison.psnr_by_size[size], 2, ' dB')}"
+            for size in ("half", "quarter")
+        ),
+        f"SSIM: {_in_words(comparison.ssim, 4)}",
+        f"Measured on {counted(change.views, 'held-out view')}, {comparison.side_px} pixels large. "
+        "Each is one run: the interval does not say whether the same settings would be better with "
+        "another seed.",
+    ]
+
+
+def _in_words(change: Difference, digits: int, unit: str = "") -> str:
+    interval = f"95 %: {change.low:+.{digits}f} to {change.high:+.{digits}f}"
+    interval = interval if change.views > 1 else "one view"
+    return f"{change.mean:+.{digits}f}{unit} ({interval}): {change.verdict}."
+
+
+def fact_rows(comparison: Comparison) -> list[tuple[str, str, str]]:
+    """(name, of the first, of the second)."""
+    first, second = (candidate.facts for candidate in comparison.candidates)
+    a, b = comparison.by_size
+    means = [
+        (f"held-out PSNR, {size} size", f"{mean_db(a[size]):.2f} dB", f"{mean_db(b[size]):.2f} dB")
+        for size in SIZES
+    ]
+    rows = [(name, first.get(name, "-"), second.get(name, "-")) for name in first | second]
+    return [*means, *rows]
+
+
+def distinct_name(folder: Path, other: Path) -> str:
+    """A run folder's own name, with its parent's where the other folder has the same."""
+    here, there = folder.absolute(), other.absolute()
+    return here.name if here.name != there.name else f"{here.parent.name}/{here.name}"
+
+
+def write_comparison(folder: Path, comparison: Comparison) -> list[Path]:
+    """Write the report and the table into `folder`, which exists. Raises SplatError."""
+    a, b = (candidate.name for candidate in comparison.candidates)
+    pairs = list(zip(*comparison.scores, strict=True))
+    table = folder / "compare.csv"
+    lines: list[tuple[str, ...]] = [
+        ("photograph", "first_psnr_db", "second_psnr_db", "first_ssim", "second_ssim")
+    ]
+    for one, two in pairs:
+        figures = (one.psnr_db, two.psnr_db, one.ssim, two.ssim)
+        lines.append((one.name, *(f"{x:.5f}" for x in figures)))
+    write_csv(table, lines)
+    report = folder / "report.html"
+    rows = [
+        (
+            one.name,
+            *(f"{score.psnr_db:.2f} dB" for score in (one, two)),
+            f"{two.psnr_db - one.psnr_db:+.2f} dB",
+        )
+        for one, two in pairs
+    ]
+    parts = [
+        html.paragraphs(verdict_lines(comparison)),
+        html.heading("The runs"),
+        html.table(("", a, b), fact_rows(comparison)),
+        html.heading("Photograph by photograph"),
+        html.table(("photograph", f"{a}, PSNR", f"{b}, PSNR", "change"), rows),
+        html.heading("Side by side"),
+        *_pictures(comparison),
+    ]
+    html.write_page(report, f"{a} and {b}", parts)
+    return [report, table]
+
+
+def _pictures(comparison: Comparison) -> list[str]:
+    draw = [image_renderer(one.splats, one.backend) for one in comparison.candidates]
+    rows = []
+    for i, seen in enumerate(zip(*comparison.views, strict=True)):
+        shown = [(f"{seen[0].name}: the photograph", seen[0].image)]
+        for k, candidate in enumerate(comparison.candidates):
+            caption = f"{candidate.name}, {comparison.scores[k][i].psnr_db:.2f} dB"
+            shown.append((caption, draw[k](seen[k].camera)))
+        rows.append(html.pictures(shown))
+    return rows

@@ -1,0 +1,151 @@
+"""The measurements behind a trade-off report as plain values, and how its curves are read."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.evaluate.coverage import CameraLayout, Gap, Patches, PoorRegion
+from stages.evaluate.evaluation import Score
+from stages.scene import Camera
+from stages.tradeoff.bootstrap import Difference, paired_difference
+from stages.tradeoff.shimmer import Framing
+
+
+@dataclass(frozen=True)
+class HistoryPoint:
+    """An evaluation during training: after `step` steps and so many seconds (time of evaluations
+    included), the number of splats and the held-out PSNR."""
+
+    step: int
+    splats: int
+    seconds: float
+    cpu_seconds: float
+    psnr_db: float
+
+
+@dataclass(frozen=True)
+class OperatingPoint:
+    """One version of the scene.
+
+    Args:
+        label: in words.
+        splats: how many.
+        psnr_db: mean over the held-out views.
+        change: of PSNR against the run's own splats.
+        size_bytes: of the file; None where none was written.
+        draw_seconds: for one picture; None where it was not timed.
+    """
+
+    label: str
+    splats: int
+    psnr_db: float
+    change: Difference
+    size_bytes: int | None = None
+    draw_seconds: float | None = None
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """What the training views show.
+
+    Args:
+        names, cameras: of the training views that were examined, in the order of `patches`.
+        patches: what they see.
+        layout: how they are arranged; None where they show no splat. Then there are no gaps and no
+            regions.
+        gaps: directions that no view is near.
+        regions: poorly covered ones.
+        floaters: [F, 3] means of the floaters.
+    """
+
+    names: tuple[str, ...]
+    cameras: tuple[Camera, ...]
+    patches: Patches
+    layout: CameraLayout | None
+    gaps: tuple[Gap, ...]
+    regions: tuple[PoorRegion, ...]
+    floaters: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Tradeoff:
+    """All that was measured of a run.
+
+    Args:
+        own: the run's splats as they are.
+        history: evaluations during training; empty where none was logged.
+        formats: the same splats in each file format, smallest file first.
+        pruned: fewer splats, fine-tuned after each removal, most first; `own` is the first.
+        scores: of `own`, by held-out view.
+        side_px: longer side of the pictures.
+        coverage: what the training views show.
+        framings: how the splats look from other viewpoints.
+        small_psnr_db: of held-out views at a quarter of the size: drawn so, and drawn at full size
+            and scaled down.
+        exported: formats that the run wrote.
+        on_cpu: whether pictures were drawn, and so timed, on the CPU.
+    """
+
+    own: OperatingPoint
+    history: tuple[HistoryPoint, ...]
+    formats: tuple[OperatingPoint, ...]
+    pruned: tuple[OperatingPoint, ...]
+    scores: tuple[Score, ...]
+    side_px: int
+    coverage: Coverage
+    framings: tuple[Framing, ...] = ()
+    small_psnr_db: tuple[float, float] = (0.0, 0.0)
+    exported: tuple[str, ...] = ()
+    on_cpu: bool = True
+
+    @property
+    def worst(self) -> Score:
+        return min(self.scores, key=lambda score: score.psnr_db)
+
+    @property
+    def knee(self) -> int:
+        """Index in `pruned` of the knee of PSNR over the number of splats; 0 for none."""
+        return knee([float(p.splats) for p in self.pruned], [p.psnr_db for p in self.pruned])
+
+
+def mean_db(scores: Sequence[Score]) -> float:
+    return float(np.mean([score.psnr_db for score in scores]))
+
+
+def psnr_change(scores: Sequence[Score], baseline: Sequence[Score]) -> Difference:
+    """Of the same views in the same order, in dB."""
+    pairs = zip(scores, baseline, strict=True)
+    return paired_difference(np.array([a.psnr_db - b.psnr_db for a, b in pairs]))
+
+
+def time_to(history: Sequence[HistoryPoint], below_db: float) -> tuple[float, float]:
+    """CPU seconds between which training came to within `below_db` of its last PSNR and stayed
+    there: those of the evaluations before and after."""
+    target = history[-1].psnr_db - below_db
+    late = [i for i, point in enumerate(history) if point.psnr_db < target]
+    first = late[-1] + 1 if late else 0
+    return (history[first - 1].cpu_seconds if first else 0.0), history[first].cpu_seconds
+
+
+def knee(costs: Sequence[float], psnr_db: Sequence[float]) -> int:
+    """Index of the point farthest above the straight line from the cheapest to the dearest, over
+    the logarithm of the cost: below it a doubling of the cost gains more PSNR than on average,
+    above it less. The dearest point where none is above the line.
+
+    Args:
+        costs: positive.
+        psnr_db: of each.
+    """
+    x, y = np.array([math.log2(cost) for cost in costs]), np.array(psnr_db)
+    low, high = int(np.argmin(x)), int(np.argmax(x))
+    span = x[high] - x[low]
+    if span <= 0:
+        return high
+    above = y - (y[low] + (x - x[low]) / span * (y[high] - y[low]))
+    best = int(np.argmax(above))
+    return best if above[best] > 1e-9 else high

@@ -1,0 +1,250 @@
+"""Measures the trade-offs of one run: from its log, and by what is cheap to do again."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages import formats
+from stages.evaluate.contribution import measure_contributions
+from stages.evaluate.coverage import camera_layout, find_gaps, patches_of, poorly_covered_regions
+from stages.evaluate.evaluation import (
+    EvaluationView,
+    Score,
+    evaluate,
+    image_renderer,
+    seconds_per_frame,
+)
+from stages.evaluate.floaters import near_camera_floaters
+from stages.formats.sog_quantisation import splats_to_write
+from stages.formats.values import drop_undrawable
+from stages.raster.backends import backend_of
+from stages.raster.torch_device import CPU
+from stages.scene import (
+    DrawSettings,
+    QuantisedSplats,
+    Splats,
+    View,
+    evenly_spaced,
+    look_at,
+    split_held_out,
+)
+from stages.scene.framing import median_depth
+from stages.tradeoff.curves import (
+    Coverage,
+    HistoryPoint,
+    OperatingPoint,
+    Tradeoff,
+    mean_db,
+    psnr_change,
+)
+from stages.tradeoff.shimmer import Framing, framings, shimmer, small_psnr_db
+
+# Of the run's splats: those that pruning to a given number is measured at.
+SHARES = (0.85, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1)
+# Training views, evenly spaced, that floaters are found by: as many as time allows, 24 at least.
+_FLOATER_PIXELS, _MIN_FLOATER_VIEWS = 24e6, 24
+TIMED_FRAMES = 4
+COVERAGE_VIEWS = 200  # at most, that coverage is measured by
+FRAMED_VIEWS = 3  # that extreme framings start from
+
+ProgressCallback = Callable[[str], None]
+PruneTo = Callable[[Splats, int], Splats]
+"""Prunes splats to so many at most, as `splat prune --max-splats` does."""
+
+
+@dataclass(frozen=True)
+class TradeoffInputs:
+    """What is measured.
+
+    Args:
+        splats: the run's last, in the coordinates of its cameras.
+        training: views that floaters are found by.
+        held_out: views that quality is measured with.
+        views: all views of the run.
+        units: of lengths.
+        backend: the rasteriser's name.
+        levelled: whether up is -Y.
+        history: as training logged it.
+        exported: formats that the run wrote.
+        quantised: the precision that was chosen for files; None where none was.
+        prune_to: what `splat prune --max-splats` does; None measures no pruning.
+        trained: the splats that pruning starts from; None for `splats`.
+    """
+
+    splats: Splats
+    training: Sequence[EvaluationView]
+    held_out: Sequence[EvaluationView]
+    views: tuple[View, ...]
+    units: str
+    backend: str
+    levelled: bool = True
+    history: Sequence[dict[str, Any]] = ()
+    exported: tuple[str, ...] = ()
+    quantised: QuantisedSplats | None = None
+    prune_to: PruneTo | None = None
+    trained: Splats | None = None
+
+    @property
+    def on_cpu(self) -> bool:
+        return backend_of(self.backend).describe() == CPU
+
+
+def measure_tradeoff(inputs: TradeoffInputs, progress: ProgressCallback) -> Tradeoff:
+    """Measure everything; held-out views decide nothing. Raises SplatError, as writers do."""
+    splats = drop_undrawable(inputs.splats)[0]
+    inputs = replace(inputs, splats=splats)
+    progress("evaluating the run's splats")
+    own_scores = _scores(inputs, splats)
+    own = _point(inputs, "as it is", splats, own_scores, own_scores)
+    progress("measuring the contribution of each splat")
+    contributions = measure_contributions(splats, inputs.training, inputs.backend)
+    progress("measuring the coverage of the capture")
+    cameras = [view.camera for view in inputs.training]
+    coverage = measure_coverage(
+        splats,
+        split_held_out(inputs.views)[0],
+        inputs.levelled,
+        near_camera_floaters(splats, contributions, cameras),
+        inputs.backend,
+    )
+    return Tradeoff(
+        own=own,
+        history=_history(inputs.history),
+        formats=_formats(inputs, own_scores, progress),
+        pruned=(own, *_pruned(inputs, own_scores, progress)),
+        scores=tuple(own_scores),
+        side_px=max(max(view.pixels.shape[:2]) for view in inputs.held_out),
+        coverage=coverage,
+        framings=measure_framings(splats, inputs.held_out, coverage, inputs.backend),
+        small_psnr_db=small_psnr_db(image_renderer(splats, inputs.backend), inputs.held_out),
+        exported=inputs.exported,
+        on_cpu=inputs.on_cpu,
+    )
+
+
+def _scores(inputs: TradeoffInputs, splats: Splats) -> list[Score]:
+    return evaluate(image_renderer(splats, inputs.backend), inputs.held_out)
+
+
+def _point(
+    inputs: TradeoffInputs, label: str, splats: Splats, scores: list[Score], own: list[Score]
+) -> OperatingPoint:
+    cameras = [view.camera for view in inputs.held_out[:TIMED_FRAMES]]
+    clock = time.process_time if inputs.on_cpu else time.perf_counter
+    seconds = float(np.median(seconds_per_frame(splats, cameras, inputs.backend, clock)))
+    change = psnr_change(scores, own)
+    return OperatingPoint(label, len(splats), mean_db(scores), change, draw_seconds=seconds)
+
+
+def _history(history: Sequence[dict[str, Any]]) -> tuple[HistoryPoint, ...]:
+    return tuple(
+        HistoryPoint(h["step"], h["splats"], h["seconds"], h["cpu_seconds"], h["psnr_db"])
+        for h in history
+        if "psnr_db" in h
+    )
+
+
+def _formats(
+    inputs: TradeoffInputs, own: list[Score], progress: ProgressCallback
+) -> tuple[OperatingPoint, ...]:
+    """The splats in every format, written as export does and read back, smallest file first."""
+    splats, points = inputs.splats, []
+    with tempfile.TemporaryDirectory() as folder:
+        for name, row in formats.FORMATS.items():
+            progress(f"writing and evaluating .{name}")
+            path = Path(folder) / f"scene.{name}"
+            held = splats_to_write(row, inputs.quantised) if inputs.quantised else splats
+            formats.write(path, held, units=inputs.units, views=inputs.views)
+            size = row.size_bytes(path)
+            read = formats.read(path)
+            antialias = read.draw_settings.antialias
+            read = replace(read, draw_settings=splats.draw_settings).with_antialias(antialias)
+            for file in row.files(path):
+                file.unlink()
+            scores = own if _identical(read, splats) else _scores(inputs, read)
+            change = psnr_change(scores, own)
+            points.append(OperatingPoint(f".{name}", len(read), mean_db(scores), change, size))
+    return tuple(sorted(points, key=lambda point: point.size_bytes or 0))
+
+
+def _identical(a: Splats, b: Splats) -> bool:
+    """To the bit: then so are the pictures."""
+    return all(
+        x.shape == y.shape and x.tobytes() == y.tobytes()
+        for x, y in zip(a.arrays, b.arrays, strict=True)
+    )
+
+
+def _pruned(
+    inputs: TradeoffInputs, own: list[Score], progress: ProgressCallback
+) -> list[OperatingPoint]:
+    """Fewer and fewer splats, as `splat prune --max-splats` leaves them. Each number is reached
+    from the one before, by the same rounds as from the trained splats."""
+    points: list[OperatingPoint] = []
+    splats = inputs.trained if inputs.trained is not None else inputs.splats
+    if inputs.prune_to is None:
+        return points
+    for share in SHARES:
+        count = round(share * len(inputs.splats))
+        if not 0 < count < len(splats):
+            continue
+        progress(f"keeping {share:.0%} of the splats")
+        splats = inputs.prune_to(splats, count)
+        points.append(_point(inputs, f"{share:.0%}", splats, _scores(inputs, splats), own))
+    return points
+
+
+def measure_coverage(
+    splats: Splats,
+    training: Sequence[View],
+    levelled: bool,
+    is_floater: NDArray[np.bool_],
+    backend: str,
+) -> Coverage:
+    """What the training views show of `splats`; is_floater [N]: which of these are floaters."""
+    chosen = evenly_spaced(training, COVERAGE_VIEWS)
+    cameras = tuple(splats.draw_settings.camera(view.camera) for view in chosen)
+    patches = patches_of(splats, cameras, backend)
+    layout = camera_layout(cameras, patches, levelled) if len(patches.centres) else None
+    return Coverage(
+        names=tuple(view.name for view in chosen),
+        cameras=cameras,
+        patches=patches,
+        layout=layout,
+        gaps=find_gaps(layout, patches, cameras) if layout else (),
+        regions=poorly_covered_regions(splats, patches, cameras, backend) if layout else (),
+        floaters=splats.means[is_floater].astype(np.float64),
+    )
+
+
+def measure_framings(
+    splats: Splats, held_out: Sequence[EvaluationView], coverage: Coverage, backend: str
+) -> tuple[Framing, ...]:
+    """How the splats look in extreme framings, and from the largest gap of the capture."""
+    draw = image_renderer(splats, backend)
+    cameras = [view.camera for view in evenly_spaced(held_out, FRAMED_VIEWS)]
+    found = framings(draw, [(c, median_depth(c, splats.means)) for c in cameras])
+    layout = coverage.layout
+    if layout and layout.inward and coverage.gaps:
+        eye = layout.middle + layout.distance * coverage.gaps[0].direction
+        pose = look_at(eye, layout.middle, up=layout.up)
+        camera = replace(cameras[0], world_to_camera=pose)
+        found += (Framing("from gap 1", *shimmer(draw, camera, layout.distance)),)
+    return found
+
+
+def floater_views(views: Sequence[View], draw_settings: DrawSettings) -> list[View]:
+    """The training views that floaters are found by."""
+    if not views:
+        return []
+    camera = draw_settings.camera(views[0].camera)
+    most = round(_FLOATER_PIXELS / (camera.width * camera.height))
+    return evenly_spaced(views, max(_MIN_FLOATER_VIEWS, most))

@@ -1,0 +1,1 @@
+"""Stage 4: `Splats` -> `TrainedSplats`: the loop, its steps, loss, optimiser and densification."""

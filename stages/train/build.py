@@ -1,0 +1,161 @@
+"""The trainer of a run, made from its settings."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from stages.base.stage import Report
+from stages.base.text import counted
+from stages.evaluate.evaluation import load_evaluation_views
+from stages.raster.backends import backend_of, backend_of_settings
+from stages.scene import Reconstruction, draw_settings_of, split_held_out, training_extent
+from stages.scene.light import LEAST_EXPLAINED, NOISE_EV, spread_ev
+from stages.train.camera_refinement import CameraRefinement
+from stages.train.cap import cap_for, splats_determined
+from stages.train.schedule import Schedule
+from stages.train.trainer import Trainer
+from stages.train.views import load_views
+
+if TYPE_CHECKING:
+    from stages.train.stage import TrainSettings
+
+
+def make_trainer(
+    reconstruction: Reconstruction,
+    n_start: int,
+    settings: TrainSettings,
+    folder: Path,
+    report: Report,
+) -> Trainer:
+    """Load the training views and choose the cap of splats. n_start: splats at the start. Raises
+    SplatError."""
+    began = time.monotonic()
+    kept, held = split_held_out(reconstruction.views)
+    light = corrects_light(reconstruction, settings.light, report)
+    vignetting = corrects_vignetting(reconstruction, settings.light, report)
+    train = load_views(reconstruction.folder, kept, settings.train_side, folder, light, vignetting)
+    draw_settings = draw_settings_of(
+        reconstruction.views, settings.train_side, light, settings.antialias, vignetting
+    )
+    held_out = load_evaluation_views(reconstruction.folder, held, draw_settings)
+    sides = [max(v.camera.width, v.camera.height) for v in reconstruction.views]
+    if smaller := sum(side < settings.train_side for side in sides):
+        report.warn(
+            "train-photographs-smaller",
+            f"Used at their own size, smaller than --train-side {settings.train_side}: "
+            f"{counted(smaller, 'photograph')}. --max-side sets how large ingest keeps them.",
+        )
+    determined = splats_determined([view.levels[-1].camera for view in train], settings.sh_degree)
+    cap = cap_for(folder, settings.max_splats, determined)
+    report.metric("splat_cap", cap.splats)
+    report.metric("splat_cap_from", cap.origin)
+    report.metric("splat_cap_free_mib", cap.free_mib)
+    extent, backend = training_extent(reconstruction), backend_of_settings(settings)
+    refinement = None
+    if settings.refine_in_training:
+        cameras = {view.name: view.levels[-1].camera for view in train}
+        cameras |= {view.name: view.camera for view in held_out}
+        refinement = CameraRefinement.of(cameras, extent)
+        backend = _on_the_host(backend, report)
+    seconds = settings.seconds and max(settings.seconds - (time.monotonic() - began), 1.0)
+    return Trainer(
+        schedule=Schedule(
+            steps=_limited_steps(settings, len(train), report),
+            extent=extent,
+            sh_degree=settings.sh_degree,
+            n_start=min(n_start, cap.splats),
+            seed=settings.seed,
+        ),
+        train=train,
+        held_out=held_out,
+        draw_settings=draw_settings,
+        cap=cap.splats,
+        folder=folder,
+        report=report,
+        smooth=settings.smooth,
+        random_background=settings.background == "any",
+        backend=backend,
+        seconds=seconds,
+        most_steps=settings.steps_per_view * len(train),
+        refinement=refinement,
+        within=settings.within,
+    )
+
+
+def _limited_steps(settings: TrainSettings, views: int, report: Report) -> int:
+    """The steps of a run on so many training views; warns if they are fewer than requested."""
+    most = settings.steps_per_view * views
+    if not most or settings.steps <= most:
+        return settings.steps
+    report.warn(
+        "train-steps-limited",
+        f"Training makes {most:,} steps instead of {settings.steps:,}: {settings.steps_per_view} "
+        f"for each of {counted(views, 'training view')}. More would fit these views alone; "
+        "--steps-per-view 0 makes them all.",
+    )
+    return most
+
+
+def _on_the_host(backend: str, report: Report) -> str:
+    """The backend, or the CPU's instead of a GPU's, whose steps do not give out their gradients."""
+    if backend_of(backend).name != "gpu":
+        return backend
+    report.warn(
+        "train-refinement-on-cpu",
+        "Cameras are refined on the CPU: --refine-in-training does not use the GPU yet.",
+    )
+    return "cpu"
+
+
+def corrects_vignetting(reconstruction: Reconstruction, choice: str, report: Report) -> bool:
+    """Whether the vignetting of the views is corrected; arguments as in `corrects_light`.
+
+    Structure from motion measures it, and stores only what differs from a scene's shading."""
+    corrects = choice != "off" and any(view.vignetting for view in reconstruction.views)
+    report.metric("vignetting_corrected", corrects)
+    return corrects
+
+
+def corrects_light(reconstruction: Reconstruction, choice: str, report: Report) -> bool:
+    """Whether the views are brought to their median exposure and white balance.
+
+    "auto" does so if the light differs by more than a camera's noise and explains most of what
+    points differ by between views: otherwise surfaces shine, and a correction costs quality.
+
+    Args:
+        reconstruction: with the light of its views.
+        choice: "auto", "on" or "off", see `TrainSettings.light`.
+        report: receives metrics, and a warning if "auto" finds a difference, or "on" no light.
+    """
+    lights = [view.light for view in reconstruction.views]
+    known = any(light is not None for light in lights)
+    spread, explained = spread_ev(lights), reconstruction.light_explained
+    differs = spread > NOISE_EV
+    corrects = choice == "on" or (choice == "auto" and differs and explained >= LEAST_EXPLAINED)
+    report.metric("light_spread_ev", round(spread, 4))
+    report.metric("light_corrected", corrects and known)
+    if choice == "on" and not known:
+        report.warn(
+            "train-light-unknown",
+            "--light on changes nothing: photographs share too few usable points to measure their "
+            "exposure and white balance.",
+        )
+    if choice != "auto" or not differs:
+        return corrects
+    if corrects:
+        report.warn(
+            "train-light-evened",
+            f"Exposure or white balance differ between photographs (typically by {spread:.2f} EV): "
+            "they are brought to the median photograph's. Lock both in the camera to lose nothing.",
+        )
+    else:
+        report.warn(
+            "train-light-not-evened",
+            f"Light differs between photographs (typically by {spread:.2f} EV) and is left as it "
+            f"is: it explains only {max(0.0, explained):.0%} of what points differ by between "
+            "photographs, which shiny surfaces cause, too. If the camera changed its exposure or "
+            "white balance, use --light on.",
+        )
+    return corrects

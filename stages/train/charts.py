@@ -1,0 +1,80 @@
+"""The contact sheet of held-out views beside their renders (`held_out.png`), and the plot of the
+evaluations during training (`training.png`)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.base.atomic import replacing
+from stages.evaluate.evaluation import SIZES
+from stages.scene.pictures import scaled_image
+
+SHEET_COLUMN = 480  # pixels, at most
+ERROR_GAIN = 4.0
+
+
+def contact_sheet(
+    path: Path,
+    rows: Sequence[tuple[str, Sequence[float], NDArray[np.float32], NDArray[np.float32]]],
+) -> None:
+    """A PNG with a numbered row for each (name, PSNR in dB at each of `SIZES`, render,
+    photograph): photograph, render, absolute error x 4; and a .txt beside it that says which number
+    is which photograph, since the picture's font knows only ASCII."""
+    import cv2
+    from PIL import Image
+
+    strips, legend = [], []
+    for number, (name, decibels, image, truth) in enumerate(rows, 1):
+        figures = ", ".join(
+            f"{size} size {psnr:.2f} dB" for size, psnr in zip(SIZES, decibels, strict=True)
+        )
+        legend.append(f"{number}  {name}  {figures}\n")
+        error = np.clip(np.abs(image - truth) * ERROR_GAIN, 0, 1)
+        tiles = [_fitted(tile) for tile in (truth, image, error)]
+        strip = np.hstack(tiles)
+        title = np.full((26, strip.shape[1], 3), 24, np.uint8)
+        shown = f"{number}  {name if name.isascii() else f'(see {path.stem}.txt)'}"
+        text = f"{shown}   photograph | render {decibels[0]:.2f} dB | error x{ERROR_GAIN:.0f}"
+        cv2.putText(title, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (220,) * 3, 1, cv2.LINE_AA)
+        strips.append(np.vstack([title, strip]))
+    if not strips:
+        return
+    width = max(strip.shape[1] for strip in strips)
+    padded = [np.pad(s, ((0, 0), (0, width - s.shape[1]), (0, 0))) for s in strips]
+    with replacing(path) as temporary:
+        Image.fromarray(np.vstack(padded)).save(temporary, format="PNG")
+    with replacing(path.with_suffix(".txt")) as temporary:
+        temporary.write_text("".join(legend), encoding="utf-8")
+
+
+def training_plot(path: Path, history: Sequence[dict[str, Any]]) -> None:
+    """A PNG of held-out PSNR (dB) and number of splats over the steps; none without two figures."""
+    from stages.base.plots import BLUE, ORANGE, new_plot, write_plot
+
+    points = [h for h in history if "psnr_db" in h]
+    if len(points) < 2:
+        return
+    steps = [h["step"] for h in points]
+    figure, quality = new_plot("Evaluations during training", "step", "held-out PSNR (dB)")
+    counts = quality.twinx()
+    counts.set_ylabel("splats")
+    lines = [
+        *quality.plot(steps, [h["psnr_db"] for h in points], "o-", color=BLUE, ms=4),
+        *counts.plot(steps, [h["splats"] for h in points], "s--", color=ORANGE, ms=3),
+    ]
+    counts.set_ylim(bottom=0)
+    counts.yaxis.set_major_formatter("{x:,.0f}")
+    quality.legend(lines, ["held-out PSNR", "splats"], loc="lower right")
+    write_plot(path, figure)
+
+
+def _fitted(image: NDArray[np.float32]) -> NDArray[np.uint8]:
+    height, width = image.shape[:2]
+    scale = min(1.0, SHEET_COLUMN / width)
+    small = scaled_image(image, max(1, round(width * scale)), max(1, round(height * scale)))
+    return np.asarray(np.round(np.clip(small, 0, 1) * 255), np.uint8)

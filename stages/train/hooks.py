@@ -1,0 +1,183 @@
+"""What happens between training steps, each as one object with one method. `step_hooks` lists them
+in their order. Splats are removed by three: `FloaterRemoval`, `Densification` and `Sparsification`.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.base.errors import Interrupted
+from stages.evaluate.evaluation import EvaluationView, evaluate, evaluation_subset
+from stages.raster.backends import backend_of, rasteriser_of
+from stages.scene import Camera, Splats, morton
+from stages.train.colour_refit import ColourRefit, needs_colour_refit
+from stages.train.density import (
+    AdaptiveDensity,
+    BoundedDensity,
+    DensityRule,
+    gradient_threshold,
+)
+from stages.train.free_space import FreeSpace, known_free_space
+from stages.train.optimiser import empty_model
+from stages.train.sparsification import Sparsification
+from stages.train.time_limit import TimeLimit
+
+if TYPE_CHECKING:
+    from stages.train.trainer import Trainer
+    from stages.train.views import Level, TrainingView
+
+CHECKPOINT_SECONDS = 30.0
+EVALUATIONS = 10  # evenly spaced over the run
+FLOATER_REMOVALS = 20  # during a run, evenly spaced
+
+
+class StepHook(Protocol):
+    """Something that happens between steps."""
+
+    def after_step(self, trainer: Trainer, step: int) -> None:
+        """Is called when `step` steps are done."""
+
+
+def step_hooks(trainer: Trainer, start: Splats) -> list[StepHook]:
+    """All hooks of a run that starts from `start`, in the order in which they are called."""
+    adaptive = AdaptiveDensity(trainer.schedule.extent, len(trainer.train))
+    density: DensityRule = BoundedDensity(adaptive, trainer.within) if trainer.within else adaptive
+    # Of very many held-out views a part is evaluated, so that it takes less time than training.
+    views = [trainer.held_out[i] for i in evaluation_subset(len(trainer.held_out))]
+    time_limit = TimeLimit(trainer.seconds, trainer.most_steps)
+    # of the cameras before their refinement, which a resumed run has, too
+    free_space = known_free_space(start.means, [v.levels[-1].camera for v in trainer.train])
+    return [
+        FloaterRemoval(free_space),
+        Densification(density),
+        Sparsification(start, density),
+        FinalColourRefit(),
+        Evaluation(views, time_limit),
+        time_limit,
+        Checkpointing(),
+        Progress(),
+        LivePreview(),
+    ]
+
+
+@dataclass(frozen=True)
+class FloaterRemoval:
+    """Removes floaters a few times during the run, see `free_space`."""
+
+    free_space: FreeSpace
+
+    def after_step(self, trainer: Trainer, step: int) -> None:
+        if trainer.schedule.passes(step, FLOATER_REMOVALS):
+            model = trainer.model
+            trainer.replace_model(model.take(~self.free_space.contains(model.means)))
+
+
+@dataclass(frozen=True)
+class Densification:
+    """Applies adaptive density control at the steps that the schedule names."""
+
+    density: DensityRule
+
+    def after_step(self, trainer: Trainer, step: int) -> None:
+        schedule = trainer.schedule
+        if not schedule.densifies_after(step - 1):
+            return
+        model = self.density.cull(trainer.model, schedule.removes_giants(step - 1))
+        budget = min(schedule.budget(step - 1, trainer.cap), trainer.cap)  # the cap may have fallen
+        model = self.density.grow(model, budget, gradient_threshold(schedule.steps))
+        trainer.replace_model(model.take(morton.morton_order_of(model.means)))
+
+
+@dataclass(frozen=True)
+class FinalColourRefit:
+    """Fits the colours to all training views at the end, see `colour_refit`."""
+
+    def after_step(self, trainer: Trainer, step: int) -> None:
+        last = step == trainer.schedule.steps
+        if not last or not needs_colour_refit(trainer.dropout, len(trainer.train)):
+            return
+        model = trainer.model
+        trainer.stepper.load(empty_model())  # a device may not hold the model twice
+        refit = ColourRefit(
+            rasteriser_of(backend_of(trainer.backend).name),
+            trainer.raster_settings(trainer.schedule.sh_degree),
+            lambda: map(_level_with_camera, trainer.train, trainer.cameras),
+            trainer.smooth,
+        )
+        trainer.stepper.load(refit.of(model))
+
+
+def _level_with_camera(view: TrainingView, camera: Camera) -> Level:
+    """The view at full size, with its refined camera."""
+    return replace(view.levels[-1], camera=camera)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Evaluates held-out views at the evaluation points and enters the result in the history."""
+
+    views: list[EvaluationView]
+    time_limit: TimeLimit
+
+    def after_step(self, trainer: Trainer, step: int) -> None:
+        if not trainer.schedule.passes(step, EVALUATIONS):
+            return
+        began = trainer.clock.elapsed().seconds
+        scores = evaluate(trainer.render, self.views)
+        entry: dict[str, Any] = {"step": step, "splats": len(trainer.stepper)}
+        self.time_limit.reserve_for_end(trainer.clock.elapsed().seconds - began)
+        if scores:
+            entry["psnr_db"] = float(np.mean([score.psnr_db for score in scores]))
+            entry["ssim"] = float(np.mean([score.ssim for score in scores]))
+        trainer.history.append(entry)
+        trainer.times.append(trainer.clock.elapsed())
+
+
+@dataclass
+class Checkpointing:
+    """Writes a checkpoint every CHECKPOINT_SECONDS, and before it raises Interrupted if the report
+    asks to stop."""
+
+    last: float = field(default_factory=time.monotonic)
+
+    def after_step(self, trainer: Trainer, step: int) -> None:
+        steps = trainer.schedule.steps
+        stops = trainer.report.stop_requested.is_set() and step < steps
+        if stops or time.monotonic() - self.last > CHECKPOINT_SECONDS:
+            trainer.save(step)
+            self.last = time.monotonic()
+        if stops:
+            raise Interrupted(f"train stopped after step {step} of {steps}")
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Reports the progress of the run."""
+
+    def after_step(self, trainer: Trainer, step: int) -> None:
+        numbers: dict[str, float | int | str] = {
+            "splats": len(trainer.stepper),
+            "loss": round(trainer.loss, 4),
+        }
+        if trainer.history and "psnr_db" in trainer.history[-1]:
+            numbers["held_out_psnr_db"] = round(trainer.history[-1]["psnr_db"], 2)
+        trainer.report.progress(step, trainer.schedule.steps, "training", **numbers)
+
+
+@dataclass(frozen=True)
+class LivePreview:
+    """Offers to render the current model, with the SH coefficients that are trained by now."""
+
+    def after_step(self, trainer: Trainer, step: int) -> None:
+        degree = trainer.schedule.active_sh_degree(step - 1)
+
+        def draw(camera: Camera) -> NDArray[np.uint8]:
+            image = np.clip(trainer.render(camera, degree), 0.0, 1.0)
+            return np.rint(image * 255).astype(np.uint8)
+
+        trainer.report.offer(draw)

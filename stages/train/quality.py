@@ -1,0 +1,105 @@
+"""The final evaluation of a run: metrics, a table, a plot and a contact sheet."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stages.base.atomic import write_csv
+from stages.base.stage import Report
+from stages.evaluate.evaluation import (
+    EvaluationView,
+    ImageRenderer,
+    Score,
+    evaluate_at_sizes,
+    evaluation_subset,
+    psnr_as_taken_db,
+    psnr_inside_masks_db,
+    psnr_name,
+)
+from stages.scene import DrawSettings, Reconstruction, split_held_out
+from stages.train.charts import contact_sheet, training_plot
+from stages.train.clock import Elapsed
+
+
+def write_quality(
+    render: ImageRenderer,
+    views: Sequence[EvaluationView],
+    draw_settings: DrawSettings,
+    reconstruction: Reconstruction,
+    folder: Path,
+    report: Report,
+) -> None:
+    """Evaluate the held-out `views`: metrics go into the report, the contact sheet `held_out.png`
+    with its legend into the folder.
+
+    Args:
+        render: draws the trained splats.
+        draw_settings: they are drawn with.
+        reconstruction: the held-out views come from.
+    """
+    by_size = evaluate_at_sizes(render, views, with_flip=True)
+    scores = by_size["full"]
+    if scores:
+        _report_scores(by_size, report)
+    else:
+        report.warn(
+            "train-nothing-held-out",
+            "Too few photographs to hold one out: quality was not measured.",
+        )
+    if (draw_settings.light or draw_settings.vignetting) and scores:
+        _, held = split_held_out(reconstruction.views)
+        plain, adapted = psnr_as_taken_db(render, reconstruction.folder, held, draw_settings)
+        report.metric("psnr_as_taken_db", round(plain, 3))
+        report.metric("psnr_adapted_db", round(adapted, 3))
+    inside = psnr_inside_masks_db(render, views)
+    if inside is not None:
+        report.metric("psnr_inside_db", round(inside, 3))
+    figures = [
+        {psnr_name(name): score.psnr_db for name, score in zip(by_size, same, strict=True)}
+        for same in zip(*by_size.values(), strict=True)
+    ]
+    held_out = [asdict(score) | more for score, more in zip(scores, figures, strict=True)]
+    report.metric("held_out", held_out)
+    sides = (max(view.pixels.shape[:2]) for view in views)
+    report.metric("evaluated_side_px", max(sides, default=0))
+    rows = []
+    worst = min(range(len(scores)), key=lambda i: scores[i].psnr_db, default=0)
+    for i in sorted({*evaluation_subset(len(scores)), worst}) if scores else ():
+        image = np.clip(render(views[i].camera), 0.0, 1.0)
+        rows.append((views[i].name, list(figures[i].values()), image, views[i].image))
+    contact_sheet(folder / "held_out.png", rows)
+
+
+def write_history(
+    history: Sequence[dict[str, Any]], times: Sequence[Elapsed], folder: Path, report: Report
+) -> None:
+    """The evaluations during the run as `history.csv` and as a plot. The times, which differ
+    between equal runs, go only into the report."""
+    rows: list[tuple[object, ...]] = [("step", "splats", "psnr_db", "ssim")]
+    for entry in history:
+        psnr_db, ssim = (entry.get(name, float("nan")) for name in ("psnr_db", "ssim"))
+        rows.append((entry["step"], entry["splats"], f"{psnr_db:.4f}", f"{ssim:.5f}"))
+    write_csv(folder / "history.csv", rows)
+    training_plot(folder / "training.png", history)
+    both = zip(history, times, strict=True)
+    report.metric("history", [entry | asdict(elapsed) for entry, elapsed in both])
+
+
+def _report_scores(by_size: Mapping[str, Sequence[Score]], report: Report) -> None:
+    scores = by_size["full"]
+    values = [score.psnr_db for score in scores]
+    worst = min(scores, key=lambda score: score.psnr_db)
+    flips = [score.flip for score in scores if score.flip is not None]
+    for name, same in by_size.items():
+        mean = float(np.mean([score.psnr_db for score in same]))
+        report.metric(psnr_name(name), round(mean, 3))
+    report.metric("psnr_worst_db", round(worst.psnr_db, 3))
+    report.metric("psnr_worst_view", worst.name)
+    report.metric("psnr_spread_db", round(float(np.std(values)), 3))
+    report.metric("ssim", round(float(np.mean([score.ssim for score in scores])), 4))
+    report.metric("flip", round(float(np.mean(flips)), 4))

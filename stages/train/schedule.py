@@ -1,0 +1,148 @@
+"""What happens at which step, after Kerbl et al. 2023.
+
+The published schedule has 30,000 steps. Its events are scaled to the number of steps of the run,
+which may change during the run. Unlike the published one, it never resets opacities, draws at half
+the size in the first fifth and at several sizes after densification, raises the learning rates of
+short runs, lets all of them decay, and bounds the number of splats by a budget that rises linearly.
+Steps count from 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stages.train.optimiser import LearningRates
+
+PUBLISHED_STEPS = 30_000
+MEANS_LR, MEANS_LR_END = 1.6e-4, 1.6e-6  # x scene extent: at the first and at the last step
+DENSIFICATION_END = 0.5  # share of the run in which the model is densified
+# A run that is n times shorter than the published one, at most MOST_SHORTENED times, multiplies its
+# learning rates by n to these powers (docs/experiments/densification.md).
+MOST_SHORTENED = 20.0
+RATES_POWER = 0.6  # all, but that of the means at the end
+MEANS_END_POWER = 1.2
+# Learning rates decay from this share of the run on, to this share of their value.
+RATE_DECAY_FROM, RATE_DECAY_END = 0.6, 0.1
+MIN_DENSIFY_INTERVAL = 50  # steps: fewer see too little of the scene
+SCALES = (0.25, 0.5, 1.0)  # of the images' sides
+QUARTER, HALF, FULL = range(len(SCALES))
+HALF_SIZE_END = 0.2  # share of the run that draws small images: they are cheap and smooth
+# After densification, one of 20 steps draws at a quarter and two at half of the size, so that the
+# splats are right in small images, too.
+SMALLER_STEPS = {4: QUARTER, 9: HALF, 19: HALF}
+SMALLER_STEPS_PERIOD = 20
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """The schedule of a run.
+
+    Args:
+        steps: of the whole run.
+        extent: of the scene, world units.
+        sh_degree: of the final model.
+        n_start: number of splats at the start.
+        seed: of all random numbers.
+        since: (step, share of the run done by then) of the last change of the plan.
+    """
+
+    steps: int
+    extent: float
+    sh_degree: int
+    n_start: int
+    seed: int
+    since: tuple[int, float] = (0, 0.0)
+
+    def _scaled(self, published_step: int) -> int:
+        return max(1, round(published_step * self.steps / PUBLISHED_STEPS))
+
+    def share(self, step: int) -> float:
+        """Share of the run that is done before `step`, 0 to 1."""
+        from_step, from_share = self.since
+        if from_step == 0:
+            return step / self.steps
+        return from_share + (1.0 - from_share) * (step - from_step) / (self.steps - from_step)
+
+    def passes(self, step: int, parts: int) -> bool:
+        """Whether one of `parts` equal parts of the run ends after `step` steps."""
+        before, now = (int(parts * self.share(s) + 1e-9) for s in (step - 1, step))
+        return step == self.steps or now > before
+
+    def as_planned(self, steps: int, since: int, share: float) -> Schedule:
+        """The same run with the plan of a checkpoint."""
+        return replace(self, steps=steps, since=(since, share))
+
+    def replanned(self, step: int, steps: int) -> Schedule:
+        """The same run, of which `step` steps are done, with `steps` in all: the rest of the
+        schedule is compressed or stretched."""
+        return replace(self, steps=max(steps, step + 1), since=(step, self.share(step)))
+
+    def densifying(self, step: int) -> bool:
+        """Whether the model is still densified after `step` steps."""
+        return self.share(step) < DENSIFICATION_END
+
+    def raised(self, power: float) -> float:
+        """Factor of a learning rate: how many times shorter this run is than the published one, to
+        `power`."""
+        times = min(MOST_SHORTENED, max(1.0, PUBLISHED_STEPS / self.steps))
+        return float(times**power)
+
+    def rates(self, step: int) -> LearningRates:
+        """The learning rates of `step`: that of the means decays exponentially over the run, all
+        others from RATE_DECAY_FROM on."""
+        first = MEANS_LR * self.raised(RATES_POWER)
+        last = MEANS_LR_END * self.raised(MEANS_END_POWER)
+        means = first * (last / first) ** self.share(step)
+        decay = max(0.0, (self.share(step) - RATE_DECAY_FROM) / (1.0 - RATE_DECAY_FROM))
+        factor = self.raised(RATES_POWER) * RATE_DECAY_END**decay
+        return LearningRates().scaled(means * self.extent, factor, self.extent)
+
+    def active_sh_degree(self, step: int) -> int:
+        """One degree more every 1000 of 30,000 steps."""
+        return min(self.sh_degree, int(PUBLISHED_STEPS / 1000 * self.share(step) + 1e-9))
+
+    def densifies_after(self, step: int) -> bool:
+        """Whether to densify once `step` is done."""
+        interval = max(self._scaled(100), MIN_DENSIFY_INTERVAL)
+        done = step + 1
+        starts, ends = 500 / PUBLISHED_STEPS, DENSIFICATION_END
+        return starts <= self.share(done) <= ends and done % interval == 0
+
+    def budget(self, step: int, cap: int) -> int:
+        """Largest number of splats after `step`. It rises linearly to the cap, so that early, noisy
+        gradients do not use up what later, better ones need."""
+        share = min(1.0, self.share(step + 1) / DENSIFICATION_END)
+        return max(self.n_start, round(self.n_start + (cap - self.n_start) * share))
+
+    def removes_giants(self, step: int) -> bool:
+        return self.share(step) >= 3000 / PUBLISHED_STEPS
+
+    def level(self, step: int) -> int:
+        """Index into SCALES."""
+        if self.share(step) < HALF_SIZE_END:
+            return HALF
+        if self.densifying(step):
+            return FULL
+        return SMALLER_STEPS.get(step % SMALLER_STEPS_PERIOD, FULL)
+
+    def weight(self, step: int) -> float:
+        """Factor of the loss: the area of a pixel, in pixels of the full size (Barron et al. 2021,
+        "Mip-NeRF"). 1 while the model is densified, by gradients at the size that is drawn."""
+        return 1.0 if self.densifying(step) else SCALES[self.level(step)] ** -2
+
+    def view(self, step: int, n_views: int) -> int:
+        """Row of the training view of `step`: each of `n_views` once an epoch, in random order."""
+        round_number, place = divmod(step, n_views)
+        order = np.random.default_rng([self.seed, 1, round_number]).permutation(n_views)
+        return int(order[place])
+
+    def background(self, step: int) -> tuple[float, float, float]:
+        """A random background: splats of one colour show before another."""
+        red, green, blue = np.random.default_rng([self.seed, 3, step]).random(3)
+        return float(red), float(green), float(blue)
+
+    def dropout_key(self, step: int) -> int:
+        """32 random bits for `dropout.Dropout`."""
+        return int(np.random.default_rng([self.seed, 4, step]).integers(1 << 32))

@@ -1,0 +1,84 @@
+"""After densification, rounds of training remove the splats without which the training pictures
+would change least. The steps that are left repair what the removal costs.
+
+The pictures decide how many. A round may change them by as much as lowers their PSNR by its part
+of `LOSS_DB`, if the changes by single splats add up and are not correlated with the present error.
+So a scene keeps the splats that it needs, whatever the cap was.
+
+GaussianSpa (Zhang et al. 2025) removes splats during training by an optimisation that drives their
+opacities to zero. Here splats are chosen by how much the pictures would change, as in
+`prune.rounds`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from stages.evaluate.contribution import MAX_MEASURED_VIEWS, measure_contributions
+from stages.evaluate.evaluation import EvaluationView
+from stages.evaluate.selection import select_removal
+from stages.raster.smoothing import smoothed
+from stages.scene import Camera, Splats, evenly_spaced
+from stages.train.conversion import splats_of, valid_rows
+from stages.train.density import DensityRule
+from stages.train.optimiser import Model, empty_model
+
+if TYPE_CHECKING:
+    from stages.train.trainer import Trainer
+    from stages.train.views import TrainingView
+
+SHARES = (0.52, 0.63, 0.74, 0.85)  # of the run, after which a round happens
+LARGEST_ROUND = 0.2  # of the splats
+LOSS_DB = 0.1  # PSNR of the training views that all rounds together may cost
+
+
+@dataclass(frozen=True)
+class Sparsification:
+    """Removes splats that contribute least to the training views.
+
+    Args:
+        start: of the run; has the origin of the coordinates.
+        density: what densifies; splats outside its region stay.
+    """
+
+    start: Splats
+    density: DensityRule
+
+    def after_step(self, trainer: Trainer, step: int) -> None:
+        """See `hooks.StepHook`."""
+        before, now = trainer.schedule.share(step - 1), trainer.schedule.share(step)
+        if not any(before < share <= now for share in SHARES):
+            return
+        model = trainer.model
+        trainer.stepper.load(empty_model())  # a device may not hold the model twice
+        model = model.take(valid_rows(model))
+        trainer.replace_model(self._sparser(trainer, model))
+
+    def _sparser(self, trainer: Trainer, model: Model) -> Model:
+        """The model after one round."""
+        splats = splats_of(model, trainer.schedule.sh_degree, self.start, trainer.draw_settings)
+        if trainer.smooth:
+            splats = smoothed(splats, model.smoothing)
+        rows = evenly_spaced(range(len(trainer.train)), MAX_MEASURED_VIEWS)
+        cameras, background = list(trainer.cameras), trainer.draw_settings.background
+        views = (_evaluation_view(trainer.train[row], cameras[row], background) for row in rows)
+        contributions = measure_contributions(splats, views, trainer.backend, truncation=False)
+        change = contributions.sse * (10 ** (LOSS_DB / len(SHARES) / 10) - 1)
+        most = int(LARGEST_ROUND * len(splats))
+        every = len(rows) == len(trainer.train)
+        removal = select_removal(
+            *(splats, contributions, cameras, np.inf, most), change=change, complete=every
+        )
+        if removal is None:
+            return model
+        return model.take(~removal.removed | ~self.density.inside(model))
+
+
+def _evaluation_view(view: TrainingView, camera: Camera, background: float) -> EvaluationView:
+    level = view.levels[-1]
+    pixels = np.ascontiguousarray(level.pixels.transpose(1, 2, 0))
+    photograph = EvaluationView(view.name, camera, pixels, level.mask, level.outside)
+    return photograph.in_median_light(level.light).over(background)

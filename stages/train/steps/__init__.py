@@ -1,0 +1,1 @@
+"""One training step by backend: forward pass, loss, backward pass and Adam."""

@@ -1,0 +1,135 @@
+"""A training step for any rasteriser: loss and Adam in float64, written from their definitions.
+
+It is slow; the steps with kernels are tested against it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+from stages.raster.definition import (
+    LOG_SCALE,
+    MEAN,
+    OPACITY,
+    ROTATION,
+    SH,
+    Backward,
+    used_columns,
+)
+from stages.raster.sh import own_coefficients
+from stages.scene import TRANSPARENT
+from stages.scene.light import BRIGHT, OFFSET, POWER
+from stages.train.loss import SSIM_WEIGHT
+from stages.train.optimiser import (
+    BETA1,
+    BETA2,
+    COLUMN_COUNTS,
+    EPSILON,
+    LARGEST_GRADIENT,
+    LearningRates,
+    Model,
+    active_counts,
+)
+from stages.train.steps.step import HostStep, StepInput
+from stages.train.views import Colour, Level
+
+_RADIUS, _SIGMA = 5, 1.5  # of SSIM's window
+_C1, _C2 = 0.01**2, 0.03**2
+
+
+class ReferenceStep(HostStep):
+    """See `step.TrainingStep`."""
+
+    def step(self, given: StepInput) -> float:
+        level, settings, size = given.level, given.settings, given.level.pixels.shape[:0:-1]
+        forward = self.rasteriser.forward(self.arrays(given), level.camera, settings)
+        image = torch.tensor(forward.image[:3], dtype=torch.float64, requires_grad=True)
+        value = reference_loss(*compared(level, image, settings.background))
+        torch.autograd.backward(given.weight * math.prod(size) * value)
+        assert image.grad is not None
+        v_image = image.grad.numpy().astype(np.float32)
+        backward = self.rasteriser.backward(forward, v_image)
+        if given.use_gradients is not None:
+            given.use_gradients(self._model, backward)
+        adam(self._model, backward, (settings.sh_degree + 1) ** 2, given.rates, *size)
+        return float(value.detach())
+
+
+def compared(level: Level, image: Tensor, background: Colour) -> tuple[Tensor, Tensor]:
+    """(render, target) that the loss compares; see `train.views`."""
+    target = torch.tensor(level.pixels, dtype=torch.float64) / 255
+    drawn, inside = image.detach(), torch.ones_like(target[0])
+    if level.mask is not None:
+        inside = torch.tensor(level.mask, dtype=torch.float64) / 255
+    solid = inside if level.outside == TRANSPARENT else torch.ones_like(inside)
+    if level.light is not None:
+        gain = 2 ** (torch.tensor(level.light, dtype=torch.float64)[:, None, None] / POWER)
+        even = (target - OFFSET * (gain - 1) * solid) / gain
+        target = torch.where(target >= BRIGHT, torch.maximum(even, drawn), even)
+    if level.outside == TRANSPARENT:
+        behind = torch.tensor(background, dtype=torch.float64)[:, None, None]
+        return image, target + (1 - inside) * behind
+    return torch.where(inside > 0, image, drawn), torch.where(inside > 0, target, drawn)
+
+
+def reference_loss(image: Tensor, target: Tensor) -> Tensor:
+    """0.8 L1 + 0.2 (1 - SSIM) of pictures [3, H, W]; outside the picture, both have the target's
+    mean. See `loss_kernels` for the definition."""
+    mean = target.mean((1, 2), keepdim=True)
+    score = _ssim(image - mean, target - mean, mean)
+    l1 = (image - target).abs().mean()
+    return (1 - SSIM_WEIGHT) * l1 + SSIM_WEIGHT * (1 - score)
+
+
+def _ssim(x: Tensor, y: Tensor, mean: Tensor) -> Tensor:
+    """Of pictures less the `mean` of the second."""
+    taps = torch.exp(-((torch.arange(2 * _RADIUS + 1) - _RADIUS) ** 2) / (2 * _SIGMA**2)).to(x)
+    window = (taps[:, None] * taps[None] / taps.sum() ** 2)[None, None]
+
+    def blur(maps: Tensor) -> Tensor:
+        return functional.conv2d(maps[:, None], window, padding=_RADIUS)[:, 0]
+
+    mean_x, mean_y = blur(x), blur(y)
+    variances = blur(x * x) - mean_x**2 + blur(y * y) - mean_y**2
+    covariance = blur(x * y) - mean_x * mean_y
+    full_x, full_y = mean_x + mean, mean_y + mean
+    score = (2 * full_x * full_y + _C1) * (2 * covariance + _C2)
+    score = score / ((full_x**2 + full_y**2 + _C1) * (variances + _C2))
+    return score.mean()
+
+
+def adam(
+    model: Model,
+    backward: Backward,
+    coefficients: int,
+    rates: LearningRates,
+    width: int,
+    height: int,
+) -> None:
+    """One sparse step of Adam, as `optimiser.apply_gradients` does it."""
+    parameters = backward.parameters.astype(np.float64)
+    parameters[:, MEAN:ROTATION] *= rates.extent
+    whole = (np.abs(parameters) <= LARGEST_GRADIENT).all(1)
+    rows, g = backward.rows[whole], parameters[whole]
+    columns = g.shape[1]
+    model.steps[rows, : active_counts(coefficients)] += 1
+    t = np.maximum(model.steps[rows], 1).astype(np.float64)[:, COLUMN_COUNTS[:columns]]
+    m = BETA1 * model.moment1[rows, :columns] + (1 - BETA1) * g
+    v = BETA2 * model.moment2[rows, :columns] + (1 - BETA2) * g * g
+    model.moment1[rows, :columns], model.moment2[rows, :columns] = m, v
+    shift = rates.row(coefficients) * (m / (1 - BETA1**t)) / (np.sqrt(v / (1 - BETA2**t)) + EPSILON)
+    model.means[rows] -= shift[:, MEAN:ROTATION]
+    model.quaternions[rows] -= shift[:, ROTATION:LOG_SCALE]
+    model.log_scales[rows] -= shift[:, LOG_SCALE:OPACITY]
+    model.opacity_logits[rows] -= shift[:, OPACITY]
+    by_coefficient = shift[:, SH : used_columns(coefficients)].reshape(len(rows), coefficients, 3)
+    own = own_coefficients(model.sh_degrees[rows], coefficients)
+    model.sh[rows, :coefficients] -= np.where(own, by_coefficient, 0.0)
+    gradient = backward.means2d[whole].astype(np.float64) * (0.5 * width, 0.5 * height)
+    model.gradient_sum[rows] += np.hypot(*gradient.T) / (width * height)
+    model.gradient_count[rows] += 1

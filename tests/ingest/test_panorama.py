@@ -1,0 +1,110 @@
+"""360-degree pictures are recognised, and ordinary ones twice as wide as high are not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from stages.base.stage import Report
+from stages.ingest import stage as ingest
+from stages.ingest.panorama import SPHERE, panorama, projection_of
+from tests.ingest.spheres import sphere, two_fisheyes
+from tests.sfm.checks.bad_captures import SAMPLE
+
+
+def size(pixels: np.ndarray) -> tuple[int, int]:
+    return pixels.shape[1], pixels.shape[0]
+
+
+def cropped(path: Path) -> np.ndarray:
+    """A photograph cut to twice its height."""
+    pixels = np.asarray(Image.open(path).convert("RGB"))
+    height = pixels.shape[1] // 2
+    top = (len(pixels) - height) // 2
+    return pixels[top : top + height, : 2 * height]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_picture_of_the_whole_sphere_is_a_panorama(seed: int) -> None:
+    pixels = sphere(seed)
+    assert panorama(pixels, size(pixels), "") == "a 360-degree panorama (equirectangular)"
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_rough_seam_and_poles_that_are_no_single_point_leave_it_a_panorama(seed: int) -> None:
+    """As stitching leaves them: brighter on one side, and something else filled in at the poles."""
+    gain = np.linspace(0.97, 1.03, 512)[None, :, None]
+    pixels = np.clip(128 + gain * (sphere(seed) - 128.0), 0, 255)
+    waves = 0.4 * np.sqrt(2) * np.median(pixels.mean(axis=2).std(axis=1))
+    pixels[[0, 1, -2, -1]] += waves * np.sin(np.arange(512) / 20)[None, :, None]
+    stitched = np.clip(pixels, 0, 255).astype(np.uint8)
+    assert panorama(stitched, size(stitched), "") == SPHERE
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_half_a_sphere_and_other_ratios_are_none(seed: int) -> None:
+    pixels = sphere(seed, 1024)
+    half = pixels[128:384, :512]
+    assert panorama(half, size(half), "") == ""
+    wide = pixels[100:400]
+    assert panorama(wide, size(wide), "") == ""
+
+
+def test_ordinary_photographs_twice_as_wide_as_high_are_none() -> None:
+    for path in sorted(SAMPLE.glob("*.jpg")):
+        pixels = cropped(path)
+        assert panorama(pixels, size(pixels), "") == "", path.name
+
+
+def test_a_wall_without_contrast_is_none() -> None:
+    pixels = np.full((256, 512, 3), 180, np.uint8)
+    assert panorama(pixels, size(pixels), "") == ""
+
+
+def test_two_fisheyes_side_by_side_are_named() -> None:
+    pixels = two_fisheyes(3)
+    assert panorama(pixels, size(pixels), "") == "a pair of fisheye pictures side by side"
+
+
+@pytest.mark.parametrize(
+    "packet",
+    [
+        b'<rdf:Description GPano:ProjectionType="equirectangular" GPano:UsePanoramaViewer="True"/>',
+        b"<GPano:ProjectionType>equirectangular</GPano:ProjectionType>",
+    ],
+)
+def test_metadata_of_a_photo_sphere_are_enough(packet: bytes) -> None:
+    assert projection_of(packet) == "equirectangular"
+    black = np.zeros((60, 120, 3), np.uint8)
+    assert panorama(black, (120, 60), "equirectangular") == SPHERE
+    assert projection_of(b"<GPano:Nothing/>") == ""
+
+
+def test_panoramas_of_another_ratio_and_parts_of_one_are_named() -> None:
+    black = np.zeros((90, 120, 3), np.uint8)
+    found = panorama(black, (120, 90), "equirectangular")
+    assert found == "a panorama (equirectangular, 120 x 90, as its metadata say)"
+    part = (
+        b'GPano:ProjectionType="equirectangular" GPano:FullPanoWidthPixels="8000" '
+        b'GPano:CroppedAreaImageWidthPixels="4000"'
+    )
+    assert projection_of(part) == "partial equirectangular"
+    assert projection_of(part.replace(b"4000", b"8000")) == "equirectangular"
+    assert "(partial equirectangular" in panorama(black[:60], (120, 60), projection_of(part))
+
+
+def test_two_fisheyes_among_photographs_are_left_out_by_name(tmp_path: Path) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for number in range(3):
+        Image.fromarray(sphere(number)[:, :300]).save(folder / f"{number}.png")
+    Image.fromarray(two_fisheyes(3)).save(folder / "two.png")
+    report = Report()
+    capture = ingest.run({"photos": folder}, ingest.IngestSettings(), tmp_path / "out", report)
+    assert [photo.name for photo in capture.photos] == ["0.png", "1.png", "2.png"]
+    (message,) = [text for code, text in report.warnings if code == "ingest-left-out"]
+    assert "two.png is left out: it is a pair of fisheye pictures side by side" in message
+    assert "Stitch it" in message

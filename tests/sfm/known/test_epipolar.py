@@ -1,0 +1,67 @@
+"""Poses that fit, poses that do not, and the mistake that explains them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stages.scene import look_at
+from stages.sfm.known.epipolar import likely_mistakes, median_inlier_ratio
+
+LENS = np.array([500.0, 520.0, 310.0, 250.0])
+RANDOM = np.random.default_rng(3)
+EYES = RANDOM.normal(size=(8, 3)) * (3, 1, 1) + (0, 0, -5)
+POSES = np.array([look_at(eye, RANDOM.normal(size=3) * 0.3) for eye in EYES])
+CLOUD = RANDOM.uniform(-1, 1, (200, 3))
+
+
+def seen(pose: np.ndarray) -> np.ndarray:
+    at = CLOUD @ pose[:3, :3].T + pose[:3, 3]
+    return at[:, :2] / at[:, 2:] * LENS[:2] + LENS[2:]
+
+
+PAIRS = [(i, j, seen(POSES[i]), seen(POSES[j])) for i in range(8) for j in range(i + 1, 8)]
+
+
+def fits(poses: np.ndarray, shift_px: float = 0.0) -> float:
+    moved = [(i, j, a, b + np.array([0.0, shift_px])) for i, j, a, b in PAIRS]
+    found = median_inlier_ratio(moved, np.tile(LENS, (8, 1)), poses, 640.0)
+    assert found is not None
+    return found
+
+
+def test_right_poses_fit_and_pixels_off_do_not() -> None:
+    assert fits(POSES) == 1.0
+    assert fits(POSES, shift_px=1.0) > 0.95
+    assert fits(POSES, shift_px=12.0) < 0.3
+
+
+def test_scale_and_origin_of_the_world_do_not_matter() -> None:
+    moved = POSES @ np.linalg.inv(look_at(np.array([9.0, 5, 2]), np.zeros(3)))
+    moved[:, :3, 3] *= 1000
+    assert fits(moved) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("mistake", "expected"),
+    [
+        (lambda p: np.diag([1.0, -1, -1, 1]) @ p, "y and z"),
+        (np.linalg.inv, "camera to world instead"),
+        (lambda p: np.linalg.inv(np.diag([1.0, -1, -1, 1]) @ p), "OpenGL's camera to world"),
+        (lambda p: np.roll(p, 1, axis=0), "after its own"),
+        (lambda p: np.roll(p, -1, axis=0), "before its own"),
+        (lambda p: p[::-1], "opposite order"),
+    ],
+)
+def test_a_mistake_is_recognised(mistake, expected: str) -> None:
+    given = mistake(POSES)
+    assert fits(given) < 0.3
+    ratios = {name: fits(poses) for name, poses in likely_mistakes(given).items()}
+    (best,) = [name for name, ratio in ratios.items() if ratio > 0.9]
+    assert expected in best
+
+
+def test_without_pairs_there_is_no_ratio() -> None:
+    assert median_inlier_ratio([], np.tile(LENS, (8, 1)), POSES, 640.0) is None
+    here = np.tile(POSES[:1], (8, 1, 1))
+    assert median_inlier_ratio(PAIRS, np.tile(LENS, (8, 1)), here, 640.0) is None

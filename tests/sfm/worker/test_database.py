@@ -1,0 +1,57 @@
+"""What a killed worker leaves in COLMAP's database is repaired."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from stages.sfm.worker import database as sqlite
+
+PAIR = 2147483647
+
+
+def make(path: Path) -> Path:
+    with closing(sqlite3.connect(path)) as connection:
+        connection.executescript(
+            f"""
+            CREATE TABLE keypoints (image_id INTEGER PRIMARY KEY, rows INTEGER);
+            CREATE TABLE descriptors (image_id INTEGER PRIMARY KEY);
+            CREATE TABLE matches (pair_id INTEGER PRIMARY KEY);
+            CREATE TABLE two_view_geometries
+                (pair_id INTEGER PRIMARY KEY, rows INTEGER, config INTEGER);
+            INSERT INTO keypoints VALUES (1, 900), (2, 0), (3, 700);
+            INSERT INTO descriptors VALUES (1), (2);
+            INSERT INTO matches VALUES ({PAIR + 2}), ({PAIR + 3});
+            INSERT INTO two_view_geometries VALUES ({PAIR + 2}, 44, 2), ({2 * PAIR + 3}, 9, 5);
+            """
+        )
+    return path
+
+
+def test_half_written_photographs_and_pairs_are_deleted(tmp_path: Path) -> None:
+    path = make(tmp_path / "é #1.db")
+    sqlite.repair(path)
+    assert sqlite.keypoint_counts(path, 4) == [900, 0, 0, 0]
+    assert sqlite.verified_pairs(path) == [(0, 1, 44, 2)]
+    assert sqlite.photographs_with_features(path) == {0, 1}
+    assert sqlite.inliers_of_pairs(path) == {(0, 1): 44}
+
+
+def test_a_copy_holds_the_same_and_can_be_reset_alone(tmp_path: Path) -> None:
+    path = make(tmp_path / "a.db")
+    sqlite.copy(path, tmp_path / "b.db")
+    sqlite.delete_geometries(tmp_path / "b.db")
+    assert sqlite.verified_pairs(tmp_path / "b.db") == []
+    assert len(sqlite.verified_pairs(path)) == 2
+
+
+def test_a_file_that_is_no_database_raises_and_can_be_deleted(tmp_path: Path) -> None:
+    garbage = tmp_path / "garbage.db"
+    garbage.write_bytes(b"no database at all" * 100)
+    with pytest.raises(sqlite3.DatabaseError):
+        sqlite.repair(garbage)
+    sqlite.delete(garbage)
+    assert not garbage.exists()

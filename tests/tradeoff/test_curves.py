@@ -1,0 +1,77 @@
+"""Curves whose readings are known by hand."""
+
+import numpy as np
+import pytest
+
+from stages.evaluate.coverage import Patches
+from stages.tradeoff import summary
+from stages.tradeoff.bootstrap import paired_difference
+from stages.tradeoff.curves import (
+    Coverage,
+    HistoryPoint,
+    OperatingPoint,
+    Tradeoff,
+    knee,
+    time_to,
+)
+
+
+def history(*psnr):
+    """An evaluation every 10 CPU seconds."""
+    return [HistoryPoint(i, 100, 5.0 * i, 10.0 * i, db) for i, db in enumerate(psnr, 1)]
+
+
+def test_the_time_to_a_psnr_is_between_the_evaluations_around_it():
+    course = history(18.0, 19.0, 19.8, 20.0)
+    assert time_to(course, 0.5) == (20.0, 30.0)
+    assert time_to(course, 0.1) == (30.0, 40.0)
+
+
+def test_a_psnr_that_was_lost_again_was_not_reached():
+    assert time_to(history(19.9, 18.0, 19.0, 20.0), 0.5) == (30.0, 40.0)
+
+
+def test_a_psnr_of_the_first_evaluation_has_no_beginning():
+    assert time_to(history(19.9, 20.0), 0.5) == (0.0, 10.0)
+
+
+def test_the_knee_is_where_doubling_stops_to_gain():
+    # 2 dB for each doubling up to 8, then 0.1
+    assert knee([1, 2, 4, 8, 16, 32, 64], [10, 12, 14, 16, 16.1, 16.2, 16.3]) == 3
+    assert knee([64, 8, 1], [16.3, 16, 10]) == 1  # in any order
+
+
+def test_a_straight_line_has_no_knee():
+    assert knee([8, 4, 2, 1], [16, 14, 12, 10]) == 0
+
+
+def test_a_curve_that_gains_more_and_more_has_no_knee():
+    assert knee([8, 4, 2, 1], [16, 12, 10.5, 10]) == 0
+
+
+def test_a_loss_is_a_cost_and_its_interval_has_the_same_sign():
+    change = paired_difference(np.array([-0.2, -0.22, -0.18, -0.2, -0.21, -0.19]))
+    text = summary.costs(change)
+    assert text.startswith("costs 0.20 dB (95 %: 0.1")
+    low, high = (float(x) for x in text.split("%: ")[1].rstrip(")").split(" to "))
+    assert low < 0.2 < high
+
+
+def test_a_single_view_has_no_interval():
+    assert summary.costs(paired_difference(np.array([-0.2]))) == "costs 0.20 dB (one view)"
+    assert summary.costs(paired_difference(np.array([0.2]))) == "gains 0.20 dB (one view)"
+
+
+def empty_coverage() -> Coverage:
+    """A capture that shows nothing."""
+    none = np.zeros(0)
+    patches = Patches(np.zeros((0, 3)), 1.0, none, np.zeros((0, 1), bool), none.astype(int), none)
+    return Coverage((), (), patches, None, (), (), np.zeros((0, 3)))
+
+
+@pytest.mark.parametrize("logged", [0, 1])
+def test_a_run_without_a_log_says_so(logged):
+    own = OperatingPoint("as it is", 100, 20.0, paired_difference(np.zeros(3)))
+    course = tuple(history(20.0)[:logged])
+    tradeoff = Tradeoff(own, course, (), (own,), (), 480, empty_coverage())
+    assert summary.about_time(tradeoff) == [summary.NO_TIMES]

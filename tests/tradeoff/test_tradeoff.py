@@ -1,0 +1,315 @@
+"""The report of a small scene, and two runs side by side."""
+
+from __future__ import annotations
+
+import csv
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stages.base.errors import SplatError
+from stages.base.stage import Report
+from stages.evaluate.evaluation import load_evaluation_views
+from stages.formats import FORMATS
+from stages.prune.stage import PruneSettings, pruner_of
+from stages.scene import (
+    Camera,
+    DrawSettings,
+    QuantisedSplats,
+    TrainedSplats,
+    View,
+    evenly_spaced,
+    split_held_out,
+)
+from stages.tradeoff import summary
+from stages.tradeoff.bootstrap import BETTER, INCONCLUSIVE, WORSE
+from stages.tradeoff.comparison import (
+    Candidate,
+    compare_runs,
+    fact_rows,
+    verdict_lines,
+    write_comparison,
+)
+from stages.tradeoff.measurement import (
+    SHARES,
+    TradeoffInputs,
+    floater_views,
+    measure_tradeoff,
+)
+from stages.tradeoff.report import write_report
+from tests.small_scene import small_scene
+
+COURSE = [
+    {"step": s, "splats": s, "psnr_db": db, "seconds": s / 10, "cpu_seconds": s / 5}
+    for s, db in ((100, 20.0), (200, 24.0), (300, 24.5), (400, 24.6))
+]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return small_scene(tmp_path_factory.mktemp("photographs"))
+
+
+@pytest.fixture(scope="module")
+def inputs(scene):
+    draw_settings = DrawSettings(near=0.01, side=72)
+    reconstruction = scene.reconstruction
+    training, held = (
+        load_evaluation_views(reconstruction.folder, views, draw_settings)
+        for views in split_held_out(reconstruction.views)
+    )
+    splats = replace(scene.splats, draw_settings=draw_settings)
+    trained = TrainedSplats(splats)
+
+    def prune_to(some, count):
+        asked = PruneSettings(max_splats=count, finetune_steps=10)
+        return (
+            pruner_of(asked, reconstruction, trained, training, "cpu", Report()).prune(some).splats
+        )
+
+    return TradeoffInputs(
+        splats,
+        training,
+        held,
+        reconstruction.views,
+        "metres",
+        "cpu",
+        True,
+        COURSE,
+        ("ply", "spz"),
+        prune_to=prune_to,
+    )
+
+
+@pytest.fixture(scope="module")
+def tradeoff(inputs):
+    return measure_tradeoff(inputs, lambda label: None)
+
+
+@pytest.mark.slow
+def test_every_format_is_written_and_evaluated(tradeoff) -> None:
+    points = {point.label.removeprefix("."): point for point in tradeoff.formats}
+    assert points.keys() == FORMATS.keys()
+    assert points["ply"].change.mean == 0
+    assert points["splat"].change.mean < -0.05  # no colour that depends on the view
+    assert points["spz"].size_bytes < points["ply"].size_bytes / 3
+    sizes = [point.size_bytes for point in tradeoff.formats]
+    assert sizes == sorted(sizes)
+
+
+@pytest.mark.slow
+def test_formats_are_written_with_the_precision_that_the_run_chose(inputs, tmp_path) -> None:
+    bits = {"position": 11, "rotation": 4, "scale": 4, "colour": 4, "opacity": 4, "palette": 5}
+    decided = QuantisedSplats(inputs.splats, {"bits": bits})
+    found = [
+        next(p for p in measure_tradeoff(m, lambda label: None).formats if p.label == ".sog")
+        for m in (inputs, replace(inputs, quantised=decided))
+    ]
+    assert (found[1].size_bytes or 0) < 0.9 * (found[0].size_bytes or 0)
+    assert found[1].change.mean < found[0].change.mean
+
+
+def test_held_out_views_do_not_decide_which_splats_are_removed(tradeoff, inputs) -> None:
+    assert [point.splats for point in tradeoff.pruned] == [250, *(round(250 * s) for s in SHARES)]
+    losses = [point.psnr_db for point in tradeoff.pruned]
+    assert losses[0] - losses[1] < 1.0 < losses[0] - losses[-1]
+    noise = np.random.default_rng(0)
+    noisy = [
+        replace(p, pixels=noise.integers(0, 256, p.pixels.shape, np.uint8)) for p in inputs.held_out
+    ]
+    other = measure_tradeoff(replace(inputs, held_out=noisy), lambda label: None)
+    assert [p.splats for p in other.pruned] == [p.splats for p in tradeoff.pruned]
+    assert other.own.psnr_db < 12
+
+
+def test_pruning_by_contribution_is_better_than_by_chance(tradeoff, inputs) -> None:
+    from stages.evaluate.evaluation import mean_psnr_db
+
+    half = next(point for point in tradeoff.pruned if point.splats == 125)
+    chance = inputs.splats.take(np.random.default_rng(1).permutation(250)[:125])
+    assert half.psnr_db > mean_psnr_db(chance, inputs.held_out, "cpu") + 1
+
+
+def test_pruning_costs_what_the_report_foretold(tradeoff, inputs) -> None:
+    """The first number is reached as `splat prune` reaches it, others by way of larger ones: to a
+    twentieth of the loss."""
+    from stages.evaluate.evaluation import mean_psnr_db
+
+    counts = [round(250 * s) for s in SHARES]
+    for place, share in ((0, 1e-9), (3, 0.05)):
+        pruned = inputs.prune_to(inputs.splats, counts[place])
+        loss_db = tradeoff.own.psnr_db - mean_psnr_db(pruned, inputs.held_out, "cpu")
+        foretold_db = tradeoff.own.psnr_db - tradeoff.pruned[1 + place].psnr_db
+        assert foretold_db == pytest.approx(loss_db, abs=share * loss_db)
+
+
+def test_pruning_starts_from_what_was_trained(inputs) -> None:
+    seen = []
+
+    def keeping(splats, count):
+        seen.append((len(splats), count))
+        return splats.take(np.arange(count))
+
+    fewer = replace(inputs, splats=inputs.splats.take(np.arange(200)), trained=inputs.splats)
+    measure_tradeoff(replace(fewer, prune_to=keeping), lambda label: None)
+    counts = [round(200 * s) for s in SHARES]
+    assert seen == list(zip([250, *counts], counts, strict=False))
+
+
+def test_the_report_is_one_file_that_needs_no_other(tradeoff, inputs, tmp_path) -> None:
+    files = write_report(tmp_path, "<scene>", tradeoff, inputs)
+    assert {file.name for file in files} == {
+        *("report.html", "tradeoff.csv"),
+        *(f"{n}.png" for n in ("time", "formats", "splats", "drawing", "coverage", "photographs")),
+    }
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert not re.findall(r"(?:src|href)=\"(?!data:)", text)
+    assert "<script" not in text
+    assert "Trade-off report: &lt;scene&gt;" in text
+    assert summary.FINE_TUNED in text
+    assert tradeoff.worst.name in text
+    assert text.count("shimmer") > len(tradeoff.framings)
+    assert "<h2>Coverage</h2>" in text
+    assert "Gap 1, straight above" in text  # ten cameras in a ring
+
+
+def test_the_table_holds_every_point(tradeoff, inputs, tmp_path) -> None:
+    write_report(tmp_path, "scene", tradeoff, inputs)
+    with (tmp_path / "tradeoff.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    counts = {curve: sum(row["curve"] == curve for row in rows) for curve in ("time", "format")}
+    assert counts == {"time": len(COURSE), "format": len(FORMATS)}
+    assert all(row["psnr_db"] for row in rows)
+    last = [row for row in rows if row["curve"] == "time"][-1]
+    assert (last["splats"], last["wall_seconds"], last["psnr_db"]) == ("400", "40.00", "24.6000")
+
+
+def test_plots_have_axes_with_units_and_legends(tradeoff, inputs, tmp_path, monkeypatch) -> None:
+    from stages.tradeoff import plots
+
+    shown = {}
+    monkeypatch.setattr(plots, "write_plot", lambda path, figure: shown.update({path.stem: figure}))
+    plots.write_plots(tmp_path, tradeoff)
+    maps = shown.pop("coverage")
+    bars = [axes.get_xlabel() for axes in maps.axes if axes.get_xlabel()]
+    assert bars == ["views that see it", "angle between views (°)"]
+    assert maps.legends
+    labels = {name: figure.axes[0].get_xlabel() for name, figure in shown.items()}
+    assert labels == {
+        "time": "CPU time of all threads (s)",
+        "formats": "file size (MB)",
+        "splats": "splats",
+        "drawing": "CPU time of a picture (ms)",
+        "photographs": "number of the photograph",
+    }
+    for figure in shown.values():
+        assert figure.axes[0].get_ylabel() == "held-out PSNR (dB)"
+        assert figure.axes[0].get_legend() is not None
+
+
+@pytest.mark.slow
+def test_a_run_without_a_log_gets_the_other_curves(inputs, tmp_path) -> None:
+    tradeoff = measure_tradeoff(replace(inputs, history=()), lambda label: None)
+    files = write_report(tmp_path, "scene", tradeoff, inputs)
+    assert "time.png" not in {file.name for file in files}
+    assert summary.NO_TIMES in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+def test_a_single_held_out_view_has_no_interval(scene, inputs, tmp_path) -> None:
+    tradeoff = measure_tradeoff(replace(inputs, held_out=inputs.held_out[:1]), lambda label: None)
+    write_report(tmp_path, "scene", tradeoff, inputs)
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "one view" in text
+    assert "inf" not in re.sub(r"<[^>]*>", " ", text)
+    few = replace(scene.reconstruction, views=scene.reconstruction.views[:5])
+    both = [replace(side(scene, name), reconstruction=few) for name in "ab"]
+    lines = verdict_lines(compare_runs(*both))
+    assert lines[0] == "b against a: +0.00 dB (one view): no significant difference."
+    assert "1 held-out view," in lines[-1]
+
+
+def side(scene, name: str, splats=None) -> Candidate:
+    draw_settings = DrawSettings(near=0.01, side=72)
+    return Candidate(
+        name,
+        replace(splats or scene.splats, draw_settings=draw_settings),
+        scene.reconstruction,
+        "cpu",
+        {},
+    )
+
+
+def test_a_run_does_not_differ_from_itself(scene) -> None:
+    found = compare_runs(side(scene, "a"), side(scene, "b"))
+    assert (found.psnr.mean, found.psnr.verdict) == (0, INCONCLUSIVE)
+    assert (
+        "b against a: +0.00 dB (95 %: +0.00 to +0.00): no significant difference."
+        in verdict_lines(found)
+    )
+
+
+def test_a_worse_run_is_worse_and_the_other_way_round_better(scene) -> None:
+    fewer = side(scene, "fewer", scene.splats.take(slice(0, 120)))
+    assert compare_runs(side(scene, "all"), fewer).psnr.verdict == WORSE
+    assert compare_runs(fewer, side(scene, "all")).psnr.verdict == BETTER
+
+
+def test_a_comparison_says_which_run_is_better_at_each_size(scene) -> None:
+    fewer = side(scene, "fewer", scene.splats.take(slice(0, 120)))
+    found = compare_runs(side(scene, "all"), fewer)
+    assert [d.verdict for d in found.psnr_by_size.values()] == [WORSE] * 3
+    (_, half, quarter, *_) = verdict_lines(found)
+    assert half.startswith("At half size: -")
+    assert quarter.startswith("At quarter size: -")
+    assert [row[0] for row in fact_rows(found)][:3] == [
+        f"held-out PSNR, {size} size" for size in ("full", "half", "quarter")
+    ]
+
+
+def test_both_are_compared_at_the_smaller_size(scene) -> None:
+    small = side(scene, "small")
+    small = replace(
+        small, splats=replace(small.splats, draw_settings=DrawSettings(near=0.01, side=40))
+    )
+    found = compare_runs(side(scene, "large"), small)
+    assert found.side_px == 40
+    assert {max(p.pixels.shape[:2]) for seen in found.views for p in seen} == {40}
+
+
+def test_a_training_view_of_one_run_is_not_compared(scene) -> None:
+    views = scene.reconstruction.views[1:]
+    shifted = replace(scene.reconstruction, views=views)
+    with pytest.raises(SplatError) as error:
+        compare_runs(side(scene, "a"), replace(side(scene, "b"), reconstruction=shifted))
+    assert error.value.code == "compare-nothing-in-common"
+
+
+def test_the_comparison_shows_every_held_out_view_three_times(scene, tmp_path) -> None:
+    found = compare_runs(side(scene, "a"), side(scene, "b"))
+    report, table = write_comparison(tmp_path, found)
+    text = report.read_text(encoding="utf-8")
+    assert text.count("<img") == 3 * found.psnr.views
+    assert not re.findall(r"(?:src|href)=\"(?!data:)", text)
+    assert len(table.read_text(encoding="utf-8").splitlines()) == 1 + found.psnr.views
+
+
+def test_a_few_views_are_evenly_spaced() -> None:
+    assert evenly_spaced(range(10), 5) == [0, 2, 4, 6, 8]
+    assert evenly_spaced(range(3), 24) == [0, 1, 2]
+
+
+def test_all_training_views_decide_where_time_allows() -> None:
+    views = [View(str(i), "", camera(800, 600)) for i in range(60)]
+    assert len(floater_views(views, DrawSettings(side=480))) == 60
+    assert len(floater_views(views, DrawSettings(side=800))) == 50
+    assert (
+        len(floater_views([replace(v, camera=camera(8000, 6000)) for v in views], DrawSettings()))
+        == 24
+    )
+
+
+def camera(width: int, height: int) -> Camera:
+    return Camera(width, height, 1.0, 1.0, 0.0, 0.0, np.eye(4))

@@ -1,0 +1,142 @@
+"""How many steps a run makes: its settings, its training views and a time limit decide."""
+
+import numpy as np
+import pytest
+
+from stages.base.stage import Report
+from stages.scene import DrawSettings
+from stages.train.build import make_trainer
+from stages.train.conversion import model_of
+from stages.train.density import AdaptiveDensity, gradient_threshold
+from stages.train.hooks import step_hooks
+from stages.train.optimiser import LearningRates
+from stages.train.schedule import RATE_DECAY_END, RATES_POWER, SCALES, Schedule
+from stages.train.stage import TrainSettings
+from stages.train.time_limit import TimeLimit
+from stages.train.trainer import Trainer
+from tests.scenes import camera, cloud
+from tests.small_scene import small_scene
+from tests.train.pictures import view_of
+
+PARTS = ((0, 600), (600, 1500), (1500, 3000))  # steps before, while and after the model grows
+
+
+def schedule(steps=3000):
+    return Schedule(steps=steps, extent=1.0, sh_degree=2, n_start=1000, seed=0)
+
+
+def simulated(seconds, cost, steps=100_000, most_steps=0):
+    """(seconds that a run takes, its schedule at the end), if a step at a share costs `cost`."""
+    plan, pace = schedule(steps), TimeLimit(seconds, most_steps, reserve=1.0)
+    spent, step = 0.0, 0
+    while step < plan.steps:
+        spent += cost(plan.share(step))
+        step += 1
+        if step < plan.steps and (new := pace.steps(step, spent)):
+            plan = plan.replanned(step, new)
+    return spent + 1.0, plan
+
+
+@pytest.mark.parametrize("seconds", [20.0, 60.0, 900.0])
+@pytest.mark.parametrize(
+    "cost",
+    [
+        lambda share: 0.02,
+        lambda share: 0.02 if share < 0.2 else 0.09,  # pictures at half size come first
+        lambda share: 0.02 + 0.2 * min(share, 0.5),  # splats become more
+        lambda share: 0.05 * (1 + 0.8 * np.sin(40 * share)),  # another program on the machine
+    ],
+)
+def test_a_run_with_a_time_limit_ends_within_a_tenth_of_it_and_goes_through_all_of_its_course(
+    seconds, cost
+):
+    took, plan = simulated(seconds, cost)
+    assert took == pytest.approx(seconds, rel=0.1)
+    assert plan.share(plan.steps) == pytest.approx(1.0)
+    raised = LearningRates().sh_dc * plan.raised(RATES_POWER)
+    assert plan.rates(plan.steps).sh_dc == pytest.approx(RATE_DECAY_END * raised)
+
+
+def test_a_time_limit_plans_no_more_steps_than_the_training_views_allow():
+    took, plan = simulated(60.0, lambda share: 0.02, steps=500, most_steps=800)
+    assert plan.steps == 800
+    assert took < 20
+    assert plan.share(800) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("steps", "per_view", "wanted"), [(500, 100, 400), (400, 100, 400), (500, 0, 500)]
+)
+def test_each_training_view_takes_a_bounded_number_of_steps(tmp_path, steps, per_view, wanted):
+    scene, report = small_scene(tmp_path, views=5), Report()  # one of them is held out
+    settings = TrainSettings(steps=steps, steps_per_view=per_view, max_splats=100)
+    made = make_trainer(scene.reconstruction, 50, settings, tmp_path, report)
+    assert made.schedule.steps == wanted
+    limited = [text for code, text in report.warnings if code == "train-steps-limited"]
+    assert len(limited) == (wanted < steps)
+    assert all("400 steps instead of 500" in text for text in limited)
+
+
+def test_steps_that_take_a_second_each_still_end_in_time():
+    took, _ = simulated(60.0, lambda share: 1.0)
+    assert 30 < took < 66
+
+
+def test_a_plan_that_is_never_changed_is_the_share_of_steps():
+    plan = schedule(400)
+    assert [plan.share(step) for step in (0, 100, 400)] == [0.0, 0.25, 1.0]
+    assert sum(plan.passes(step, 10) for step in range(1, 401)) == 10
+
+
+def test_a_changed_plan_goes_on_from_where_the_run_is_and_ends_at_its_end():
+    plan = schedule(1000).replanned(300, 600)
+    assert plan.share(300) == pytest.approx(0.3)
+    assert plan.share(450) == pytest.approx(0.65)
+    assert plan.share(600) == 1.0
+    again = schedule(1000).as_planned(plan.steps, *plan.since)
+    assert again == plan
+
+
+def test_densification_takes_the_threshold_of_the_plan(tmp_path, monkeypatch):
+    """With a time limit the number of steps is only known once some have been timed."""
+    thresholds = []
+
+    def grow(self, model, budget, threshold):
+        thresholds.append(threshold)
+        return model
+
+    monkeypatch.setattr(AdaptiveDensity, "grow", grow)
+    start = cloud(50, 40, 30, degree=0)
+    view = view_of("a", np.zeros((30, 40, 3)), camera(40, 30))
+    made = Trainer(
+        *(Schedule(7000, 10.0, 0, 50, 0), [view] * 3, [], DrawSettings(near=0.1), 50, tmp_path),
+        Report(),
+        backend="cpu",
+    )
+    made.stepper.load(model_of(start))
+    densification = step_hooks(made, start)[1]
+    for steps in (7000, 28_000, 2000):
+        made.schedule = made.schedule.replanned(50, steps)
+        densify_at = next(s for s in range(51, steps) if made.schedule.densifies_after(s - 1))
+        densification.after_step(made, densify_at)
+    assert thresholds == [gradient_threshold(steps) for steps in (7000, 28_000, 2000)]
+
+
+def test_pictures_are_as_planned_to_the_very_end_of_any_plan():
+    plan = schedule(1000)
+    for step in range(10, 990, 7):
+        plan = plan.replanned(step, 1000)
+    assert [plan.level(s) for s in range(980, 1000)] == [
+        schedule().level(s) for s in range(2980, 3000)
+    ]
+
+
+def test_after_densification_some_pictures_are_smaller_and_count_by_the_area_of_their_pixels():
+    plan = schedule()
+    scales = {part: [SCALES[plan.level(s)] for s in range(*part)] for part in PARTS}
+    assert set(scales[0, 600]) == {0.5}
+    assert set(scales[600, 1500]) == {1.0}
+    late = scales[1500, 3000]
+    assert (late.count(0.25), late.count(0.5), late.count(1.0)) == (75, 150, 1275)
+    assert {plan.weight(s) for s in range(1500)} == {1.0}
+    assert [plan.weight(s) for s in range(1500, 3000)] == [scale**-2 for scale in late]
