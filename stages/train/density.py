@@ -1,5 +1,6 @@
 """Adaptive density control (Kerbl et al. 2023, section 5.2): splats are split where the mean
-gradient by their 2D position is large. Nearly transparent, very large and invalid ones are culled.
+gradient by their 2D position is large. Nearly transparent and invalid ones are culled, large ones
+are not: what is large in the world may be small in every picture, as the walls of a room are.
 
 A split replaces a splat by two along its longest axis (Deng et al. 2024, "Efficient Density Control
 for 3D Gaussian Splatting"), instead of a copy of a small splat and two random samples of a large
@@ -25,7 +26,6 @@ from stages.train.optimiser import Model
 CHILD_OFFSET = 0.6
 CHILD_LENGTH, CHILD_WIDTH = 0.7, 0.9
 CHILD_OPACITY = 0.7
-GIANT = 0.1  # x scene extent: a larger splat is culled
 GRADIENT_THRESHOLD = 2e-4  # of the mean gradient by the 2D position, as published
 # In longer runs learning rates are lower, and mean gradients smaller: see `gradient_threshold`.
 LONG_RUN = 7000  # steps
@@ -44,9 +44,6 @@ def gradient_threshold(steps: int) -> float:
 class DensityRule(Protocol):
     """What densifies: models in, models out."""
 
-    def cull(self, model: Model, remove_giants: bool) -> Model:
-        """The model without splats that no step can improve, see `AdaptiveDensity.cull`."""
-
     def grow(self, model: Model, budget: int, threshold: float = GRADIENT_THRESHOLD) -> Model:
         """The model with new splats, at most `budget` in all; accumulated gradients are reset.
         threshold: of the mean gradient by the 2D position (NDC units of the mean loss)."""
@@ -57,25 +54,9 @@ class DensityRule(Protocol):
 
 @dataclass(frozen=True)
 class AdaptiveDensity:
-    """Adaptive density control of the whole scene.
+    """Adaptive density control of the whole scene. views: number of training views."""
 
-    Args:
-        extent: of the scene, world units.
-        views: number of training views.
-    """
-
-    extent: float
     views: int
-
-    def cull(self, model: Model, remove_giants: bool) -> Model:
-        """The model without splats that are nearly transparent or not finite, and without giants if
-        `remove_giants`."""
-        keep = model.opacity_logits >= logit(MIN_OPACITY)
-        for array in model.arrays:
-            keep &= np.isfinite(array).all(tuple(range(1, array.ndim)))
-        if remove_giants:
-            keep &= np.exp(model.log_scales.max(1)) <= GIANT * self.extent
-        return model.take(keep)
 
     def grow(self, model: Model, budget: int, threshold: float = GRADIENT_THRESHOLD) -> Model:
         """The model with splats split, at most `budget` splats in all. Where the budget is short,
@@ -106,18 +87,11 @@ class BoundedDensity:
 
     Args:
         rule: is applied inside.
-        bounds: (x0, z0, x1, z1) in world units. Outside, giants are kept, since no smaller splats
-            could replace them.
+        bounds: (x0, z0, x1, z1) in world units.
     """
 
     rule: AdaptiveDensity
     bounds: tuple[float, ...]
-
-    def cull(self, model: Model, remove_giants: bool) -> Model:
-        """See `AdaptiveDensity.cull`."""
-        inside = self.inside(model)
-        outer = self.rule.cull(model.take(~inside), False)
-        return self.rule.cull(model.take(inside), remove_giants).joined(outer)
 
     def grow(self, model: Model, budget: int, threshold: float = GRADIENT_THRESHOLD) -> Model:
         """See `AdaptiveDensity.grow`."""
@@ -131,6 +105,14 @@ class BoundedDensity:
         """[N] splats inside the bounds."""
         ground = model.means[:, [0, 2]]
         return np.asarray(((ground >= self.bounds[:2]) & (ground < self.bounds[2:])).all(1))
+
+
+def cull(model: Model) -> Model:
+    """The model without splats that are nearly transparent or not finite: no step improves them."""
+    keep = model.opacity_logits >= logit(MIN_OPACITY)
+    for array in model.arrays:
+        keep &= np.isfinite(array).all(tuple(range(1, array.ndim)))
+    return model.take(keep)
 
 
 def estimated_view_counts(counts: NDArray[np.int32], views: int) -> NDArray[np.float64]:

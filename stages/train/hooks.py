@@ -20,6 +20,7 @@ from stages.train.density import (
     AdaptiveDensity,
     BoundedDensity,
     DensityRule,
+    cull,
     gradient_threshold,
 )
 from stages.train.free_space import FreeSpace, known_free_space
@@ -45,7 +46,7 @@ class StepHook(Protocol):
 
 def step_hooks(trainer: Trainer, start: Splats) -> list[StepHook]:
     """All hooks of a run that starts from `start`, in the order in which they are called."""
-    adaptive = AdaptiveDensity(trainer.schedule.extent, len(trainer.train))
+    adaptive = AdaptiveDensity(len(trainer.train))
     density: DensityRule = BoundedDensity(adaptive, trainer.within) if trainer.within else adaptive
     # Of very many held-out views a part is evaluated, so that it takes less time than training.
     views = [trainer.held_out[i] for i in evaluation_subset(len(trainer.held_out))]
@@ -87,7 +88,7 @@ class Densification:
         schedule = trainer.schedule
         if not schedule.densifies_after(step - 1):
             return
-        model = self.density.cull(trainer.model, schedule.removes_giants(step - 1))
+        model = cull(trainer.model)
         budget = min(schedule.budget(step - 1, trainer.cap), trainer.cap)  # the cap may have fallen
         model = self.density.grow(model, budget, gradient_threshold(schedule.steps))
         trainer.replace_model(model.take(morton.morton_order_of(model.means)))

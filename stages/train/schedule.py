@@ -116,9 +116,6 @@ class Schedule:
         share = min(1.0, self.share(step + 1) / DENSIFICATION_END)
         return max(self.n_start, round(self.n_start + (cap - self.n_start) * share))
 
-    def removes_giants(self, step: int) -> bool:
-        return self.share(step) >= 3000 / PUBLISHED_STEPS
-
     def level(self, step: int) -> int:
         """Index into SCALES."""
         if self.share(step) < HALF_SIZE_END:

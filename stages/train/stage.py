@@ -292,5 +292,5 @@ def load(folder: Path) -> TrainedSplats:
 
 
 STAGE = Stage(
-    name="train", version=29, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
+    name="train", version=30, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
 )

@@ -12,13 +12,13 @@ from stages.train.density import (
     CHILD_WIDTH,
     GRADIENT_THRESHOLD,
     AdaptiveDensity,
+    cull,
     gradient_threshold,
     split_along_longest_axis,
 )
 from stages.train.optimiser import LearningRates, new_model
 from stages.train.schedule import Schedule
 
-EXTENT = 10.0
 VIEWS = 8
 
 
@@ -40,7 +40,7 @@ def with_gradients(m, rows, by=1.0):
 
 
 def grow(m, cap=10**6):
-    return AdaptiveDensity(EXTENT, VIEWS).grow(m, cap)
+    return AdaptiveDensity(VIEWS).grow(m, cap)
 
 
 def centres_of_parents(grown, splits):
@@ -86,13 +86,14 @@ def test_the_opacity_of_children_is_a_share_of_their_parents(opacity):
     assert 1 / (1 + np.exp(-float(child))) == pytest.approx(CHILD_OPACITY * opacity, rel=1e-5)
 
 
-def test_faint_giant_and_broken_splats_go():
+def test_faint_and_broken_splats_go_and_large_ones_stay():
     m = model(10)
     m.opacity_logits[0] = logit(0.004)
-    m.log_scales[1] = np.log(0.11 * EXTENT)
+    m.log_scales[1] = np.log(1e3)  # the wall of a hall: large in the world, not in a picture
     m.means[2, 1] = np.nan
-    assert len(AdaptiveDensity(EXTENT, VIEWS).cull(m, remove_giants=True)) == 7
-    assert len(AdaptiveDensity(EXTENT, VIEWS).cull(m, remove_giants=False)) == 8
+    kept = cull(m)
+    assert len(kept) == 8
+    assert kept.log_scales.max() == m.log_scales[1, 0]
 
 
 @pytest.mark.parametrize("room", [0, 1, 3])

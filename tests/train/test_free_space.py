@@ -99,9 +99,6 @@ class Clouds:
     def __init__(self):
         self.made = 0
 
-    def cull(self, model, remove_giants):
-        return model
-
     def grow(self, model, budget, threshold):
         self.made += 1
         more = new_model(*(a[:1].copy() for a in model.arrays))

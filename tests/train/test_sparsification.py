@@ -23,7 +23,7 @@ STEPS = 300
 WHERE = camera(40, 30)
 NOISE = 0.1  # of the photographs: 20 dB, so that there is an error which a loss is a part of
 NEAR = DrawSettings(near=0.1)
-RULE = AdaptiveDensity(10.0, 3)
+RULE = AdaptiveDensity(3)
 
 
 HALF_TURN = np.diag([-1.0, 1.0, -1.0, 1.0])
@@ -174,7 +174,7 @@ def test_splats_outside_the_bounds_stay(tmp_path):
     start = cloud(200, 40, 30, degree=0)
     middle = float(np.median(start.means[:, 0]))
     bounds = (-1e9, -1e9, middle, 1e9)
-    density = BoundedDensity(AdaptiveDensity(10.0, 3), bounds)
+    density = BoundedDensity(AdaptiveDensity(3), bounds)
     left = sparser(trainer(tmp_path, start, bounds), start, SHARES[0], density)
     assert len(left) < 200
     assert (left.means[:, 0] >= middle).sum() == (start.means[:, 0] >= middle).sum()

@@ -22,7 +22,7 @@ from stages.train import stage as train
 from stages.train.checkpoint import MAGIC
 from stages.train.clock import Clock, Elapsed
 from stages.train.conversion import splats_of
-from stages.train.density import AdaptiveDensity
+from stages.train.density import AdaptiveDensity, cull
 from stages.train.hooks import EVALUATIONS
 from stages.train.loss import image_loss
 from stages.train.optimiser import LearningRates, apply_gradients, new_model
@@ -36,7 +36,6 @@ from tests.train.pictures import view_of
 
 
 def trainer(views, start, steps, folder, report=None, degree=0, cap=10_000, backend="cpu"):
-    # of an extent of 10, no splat of these toys is large enough to be culled as a giant
     schedule = Schedule(steps=steps, extent=10.0, sh_degree=degree, n_start=len(start), seed=0)
     held_out = [
         EvaluationView(view.name, view.levels[-1].camera, view.levels[-1].pixels.transpose(1, 2, 0))
@@ -339,9 +338,9 @@ def test_the_stage_says_so_when_nothing_is_left(tmp_path, monkeypatch):
 
 def test_nothing_at_all_can_be_taken_grown_and_culled():
     empty = new_model(*splat_arrays(grid(2).take(np.zeros(4, bool))))
-    strategy = AdaptiveDensity(1.0, views=8)
+    strategy = AdaptiveDensity(views=8)
     assert len(strategy.grow(empty, 100)) == 0
-    assert len(strategy.cull(empty, remove_giants=True)) == 0
+    assert len(cull(empty)) == 0
     assert len(empty.take(np.zeros(0, bool))) == 0
 
 
