@@ -6,19 +6,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from stages import STAGE_NAMES, load_stage
+import numpy as np
+from numpy.typing import NDArray
+
 from stages.base.settings import changed
 from stages.raster.backends import backend_of_settings
+from stages.raster.draw import render
 from stages.run.pipeline import Listener, Pipeline
 from stages.run.results import reconstruction_of
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from stages.scene import Camera, ExportedAssets, Reconstruction, Splats
+from stages.run.stages import STAGE_NAMES, STAGE_OF
+from stages.scene import Camera, ExportedAssets, Reconstruction, Splats
+from stages.train.settings import PRESETS
+from stages.viewer.sinks import eight_bits
 
 
 @dataclass(frozen=True)
@@ -39,9 +40,6 @@ class Scene:
 
     def draw(self, camera: Camera) -> NDArray[np.uint8]:
         """sRGB picture [H, W, 3] from a camera in the world of `reconstruction`."""
-        from stages.raster.draw import render
-        from stages.viewer.sinks import eight_bits
-
         return eight_bits(render(self.splats, camera, backend=self.backend).image)
 
 
@@ -64,11 +62,9 @@ def process(
     Raises SplatError as `splat process` reports it, TypeError for an unknown option, ValueError
     for an unknown preset.
     """
-    from stages.train.stage import PRESETS
-
     if preset not in PRESETS:
         raise ValueError(f"preset {preset!r}: one of {', '.join(PRESETS)} is wanted")
-    settings: dict[str, Any] = {name: load_stage(name).settings_type() for name in STAGE_NAMES}
+    settings: dict[str, Any] = {name: STAGE_OF[name].settings_type() for name in STAGE_NAMES}
     settings["train"] = PRESETS[preset]
     known = {field.name for found in settings.values() for field in fields(found)}
     if unknown := options.keys() - known:

@@ -182,7 +182,7 @@ def step(label: str, **counts: int) -> None:
 
 def note_compiling() -> None:
     """Explain the delay if the kernels are not compiled yet."""
-    from stages.raster.kernels import cache
+    from stages.raster.kernels import cache  # importing it makes a folder
 
     if mode.has_notes and not cache.are_compiled():
         note("Compiling the kernels; this is done once and takes about half a minute.")

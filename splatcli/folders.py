@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from stages.base.errors import RunFolderError, SplatError, UsageError
 from stages.run import results, runfolder
 from stages.run.pipeline import Pipeline
-
-if TYPE_CHECKING:
-    from stages.scene import Splats
+from stages.scene import Splats
 
 DEFAULT = Path("run")
 

@@ -9,11 +9,12 @@ from typing import Any
 import typer
 
 from splatcli import console, options
-from stages import STAGE_NAMES, load_stage
 from stages.base.settings import Setting, changed, settings_of
 from stages.raster.backends import backend_of, backend_of_settings
 from stages.run.pipeline import Pipeline
 from stages.run.runfolder import is_run_folder
+from stages.run.stages import STAGE_NAMES, STAGE_OF
+from stages.train.settings import PRESETS
 
 DEFAULT_PRESET = "standard"
 
@@ -24,20 +25,12 @@ _OF_ONE_CAPTURE = (
 )
 
 
-def presets() -> Mapping[str, Any]:
-    """Training settings by preset name."""
-    from stages.train.stage import PRESETS
-
-    found: Mapping[str, Any] = PRESETS
-    return found
-
-
 def process_parameters() -> list[Parameter]:
     """The options of `splat process`: the settings with a panel. One that several stages have is
     listed once and given to all of them."""
     found: dict[str, Parameter] = {}
     for name in STAGE_NAMES:
-        kind = load_stage(name).settings_type
+        kind = STAGE_OF[name].settings_type
         for parameter in options.parameters(kind, _shown, only_in_process=True):
             found.setdefault(parameter.name, parameter)
     shown = f"{DEFAULT_PRESET}; as before where a run goes on"
@@ -51,7 +44,7 @@ def batch_parameters() -> list[Parameter]:
 
 def stage_parameters(name: str) -> list[Parameter]:
     """All settings of one stage; for training also the preset and --view."""
-    kind = load_stage(name).settings_type
+    kind = STAGE_OF[name].settings_type
     if name == "ingest":
         return options.parameters(kind)
     own = options.parameters(kind, shown=_shown_or_recorded)
@@ -65,7 +58,7 @@ def _preset_parameter(shown: str) -> Parameter:
         "preset",
         "--preset",
         str,
-        choices=tuple(presets()),
+        choices=tuple(PRESETS),
         help="How much training: preview (minutes), standard, or best (the full recipe).",
         panel="Quality and time",
     )
@@ -83,8 +76,8 @@ def _view_parameter() -> Parameter:
 
 def _shown(setting: Setting) -> str | bool:
     """The default for the help; "by preset" for a training setting in which presets differ."""
-    values = {getattr(preset, setting.name, setting.default) for preset in presets().values()}
-    by_preset = len(values) > 1 and setting in settings_of(type(presets()[DEFAULT_PRESET]))
+    values = {getattr(preset, setting.name, setting.default) for preset in PRESETS.values()}
+    by_preset = len(values) > 1 and setting in settings_of(type(PRESETS[DEFAULT_PRESET]))
     return "by preset" if by_preset else options.shown_default(setting)
 
 
@@ -96,8 +89,8 @@ def _shown_or_recorded(setting: Setting) -> str | bool:
 
 def defaults() -> dict[str, Any]:
     """Settings by stage name, with the default preset."""
-    fresh = {name: load_stage(name).settings_type() for name in STAGE_NAMES}
-    return {**fresh, "train": presets()[DEFAULT_PRESET]}
+    fresh = {name: STAGE_OF[name].settings_type() for name in STAGE_NAMES}
+    return {**fresh, "train": PRESETS[DEFAULT_PRESET]}
 
 
 def recorded(pipeline: Pipeline) -> dict[str, Any]:
@@ -118,7 +111,7 @@ def combined(
     """
     chosen = dict(base)
     if preset is not None and "train" in chosen:
-        chosen["train"] = presets()[preset]
+        chosen["train"] = PRESETS[preset]
     found = {name: changed(settings, given) for name, settings in chosen.items()}
     if given.keys() & {"backend", "device"}:  # an error now, not after an hour of other work
         with_backend = [settings for settings in found.values() if hasattr(settings, "backend")]

@@ -7,7 +7,11 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from stages.export.settings import ExportSettings
+from stages.prune.settings import PruneSettings
+from stages.quantise.settings import QuantiseSettings
 from stages.raster.kernels import cache
+from stages.train.settings import TrainSettings
 
 
 def main() -> None:
@@ -26,12 +30,12 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         scene = small_scene(folder)
-        settings = train.TrainSettings(steps=150, train_side=72, max_splats=400, smooth=True)
+        settings = TrainSettings(steps=150, train_side=72, max_splats=400, smooth=True)
         inputs: dict[str, Any] = {"sfm": scene.reconstruction, "seed": scene.splats}
         inputs["train"] = train.run(inputs, settings, folder, Report())
-        inputs["prune"] = prune.run(inputs, prune.PruneSettings(), folder, Report())
-        inputs["quantise"] = quantise.run(inputs, quantise.QuantiseSettings(), folder, Report())
-        export.run(inputs, export.ExportSettings(formats=("mesh",)), folder, Report())
+        inputs["prune"] = prune.run(inputs, PruneSettings(), folder, Report())
+        inputs["quantise"] = quantise.run(inputs, QuantiseSettings(), folder, Report())
+        export.run(inputs, ExportSettings(formats=("mesh",)), folder, Report())
 
 
 if __name__ == "__main__":

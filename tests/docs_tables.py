@@ -14,8 +14,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stages import STAGE_NAMES, load_stage
 from stages.base.settings import settings_of
+from stages.run.stages import STAGE_NAMES, STAGE_OF
 from tests.layers import LAYERS
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def modules(package: str) -> str:
 def stages() -> str:
     rows: list[tuple[str, ...]] = []
     for number, name in enumerate(STAGE_NAMES, 1):
-        stage = load_stage(name)
+        stage = STAGE_OF[name]
         rows.append(
             (
                 f"`{number}-{name}`",
@@ -138,7 +138,7 @@ def backends() -> str:
 
 
 def presets() -> str:
-    from stages.train.stage import PRESETS
+    from stages.train.settings import PRESETS
 
     rows: list[tuple[str, ...]] = []
     for name, preset in PRESETS.items():
@@ -159,13 +159,11 @@ def operations() -> str:
 
 
 def commands() -> str:
-    from typer.main import get_command
-
-    from splatcli.app import app
+    from splatcli.app import ENTRIES
 
     rows: list[tuple[str, ...]] = []
-    for name, command in get_command(app).commands.items():  # type: ignore[attr-defined]
-        text = " ".join((command.help or "").split("\n\n")[0].split())
+    for name, entry in ENTRIES.items():
+        text = entry.help
         own = ROOT / "splatcli" / "commands" / f"{name}.py"
         rows.append((f"`splat {name}`", text, f"`{own.relative_to(ROOT)}`" if own.exists() else ""))
     return _table(("command", "does", "module besides `splatcli/app.py`"), rows)

@@ -9,17 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.main import get_command
 
-from splatcli.app import app
-from stages import STAGE_NAMES
+from splatcli.app import ENTRIES, loaded
 from stages.base.distribution import VERSION
 from stages.formats.table import TABLE
-from stages.train.stage import PRESETS
+from stages.run.stages import STAGE_NAMES
+from stages.train.settings import PRESETS
 from tests.docs_commands import bash_lines, inline_commands, splat_commands
 from tests.docs_tables import PAGES, ROOT, renewed
 
-COMMANDS = get_command(app).commands  # type: ignore[attr-defined]
+COMMANDS = {name: loaded(name) for name in ENTRIES}
 GUIDE = (ROOT / "README.md", *sorted((ROOT / "docs" / "guide").glob("*.md")))
 README_LINES = 200
 _CODE = re.compile(r"[a-z0-9]+(?:-[a-z0-9]+)+$")

@@ -14,12 +14,13 @@ import pytest
 from PIL import Image
 
 from stages.base.stage import Report
-from stages.export import stage as export
-from stages.prune import stage as prune
-from stages.quantise import stage as quantise
+from stages.export.settings import ExportSettings
+from stages.prune.settings import PruneSettings
+from stages.quantise.settings import QuantiseSettings
+from stages.run.stages import STAGE_OF
 from stages.scene import Reconstruction, View, split_held_out
-from stages.seed import stage as seed
-from stages.train import stage as train
+from stages.seed.settings import SeedSettings
+from stages.train.settings import TrainSettings
 from tests.scenes import camera
 from tests.small_scene import small_scene
 
@@ -42,11 +43,11 @@ def made(reconstruction: Reconstruction, folder: Path) -> dict[str, bytes]:
     """By name, the bytes of all that the stages from seed to export leave but figures."""
     inputs = {"sfm": reconstruction}
     stages = (
-        (seed.STAGE, seed.SeedSettings()),
-        (train.STAGE, train.TrainSettings(steps=120, train_side=72, sh_degree=1, max_splats=400)),
-        (prune.STAGE, prune.PruneSettings()),
-        (quantise.STAGE, quantise.QuantiseSettings(formats=("spz",))),
-        (export.STAGE, export.ExportSettings(formats=("ply", "spz"))),
+        (STAGE_OF["seed"], SeedSettings()),
+        (STAGE_OF["train"], TrainSettings(steps=120, train_side=72, sh_degree=1, max_splats=400)),
+        (STAGE_OF["prune"], PruneSettings()),
+        (STAGE_OF["quantise"], QuantiseSettings(formats=("spz",))),
+        (STAGE_OF["export"], ExportSettings(formats=("ply", "spz"))),
     )
     found = {}
     for stage, settings in stages:

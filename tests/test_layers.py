@@ -185,3 +185,46 @@ def test_a_private_name_is_found() -> None:
     assert private_names("from stages.raster.draw import _x as y") == {"_x"}
     assert private_names("from stages.raster import draw\ndraw._x()") == {"_x"}
     assert private_names("from stages.raster import draw\ndraw.x(draw.__doc__)") == set()
+
+
+# Packages that are imported inside functions, and why; another late import has its reason beside
+# it.
+LATE = {
+    "torch": "takes two seconds and 200 MB, which runs with the CPU kernels do without",
+    "triton": "is there on Linux with torch for CUDA only",
+    "pxr": "is loaded in processes of its own, or where USD is written",
+    "matplotlib": "takes half a second, and is needed at the end of a stage",
+    "skimage": "takes half a second, and is needed for a mesh only",
+    "flip_evaluator": "needs no more than the views that are compared",
+    "av": "holds libraries that a run without videos need not load",
+    "pyproj": "comes with the extra `geo`",
+    "ray": "comes with the extra `cluster`",
+    "fsspec": "comes with the extra `cluster`",
+    "filelock": "takes longer than `splat --help` has",
+}
+MOST_LATE_IMPORTS = 60
+
+
+def late_imports(source: str) -> list[tuple[int, str, bool]]:
+    """(line, top package, whether a comment gives a reason) of imports inside functions."""
+    lines, found = source.splitlines(), {}
+    for function in ast.walk(ast.parse(source)):
+        if not isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef):
+            continue
+        for node in ast.walk(function):
+            if isinstance(node, ast.Import | ast.ImportFrom):
+                name = node.module if isinstance(node, ast.ImportFrom) else node.names[0].name
+                said = "#" in lines[node.lineno - 1] or any(
+                    lines[node.lineno - n].strip()[:1] == "#" for n in (2, 3)
+                )
+                found[node.lineno] = (node.lineno, (name or "").split(".")[0], said)
+    return sorted(found.values())
+
+
+def test_imports_inside_functions_are_few_and_have_their_reasons() -> None:
+    late = {name: late_imports(path.read_text("utf-8")) for name, path in MODULES.items()}
+    without = [
+        (m, line) for m, found in late.items() for line, p, r in found if not r | (p in LATE)
+    ]
+    assert not without
+    assert sum(map(len, late.values())) <= MOST_LATE_IMPORTS

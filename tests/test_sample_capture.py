@@ -19,6 +19,7 @@ from stages.run.manifest import plain
 from stages.scene import Reconstruction
 from stages.scene.rotations import similarity
 from stages.sfm import stage as sfm
+from stages.sfm.settings import SfmSettings
 
 CAPTURE = Path(__file__).parents[1] / "sample_captures" / "still_life"
 IMAGES = sorted((CAPTURE / "images").iterdir())
@@ -81,7 +82,7 @@ def test_a_rendering_from_the_truth_looks_like_the_photograph() -> None:
 def reconstruction(sample_run: Path) -> Reconstruction:
     """Of the whole capture, with the settings that everyone has."""
     settings = json.loads((sample_run / "run" / "2-sfm" / "manifest.json").read_text())["settings"]
-    assert settings == plain(asdict(sfm.SfmSettings()))
+    assert settings == plain(asdict(SfmSettings()))
     return sfm.load(sample_run / "run" / "2-sfm")
 
 

@@ -13,6 +13,7 @@ from rich.text import Text
 
 from splatcli import console, log, options, run_settings
 from splatcli.arguments import Cluster
+from stages.distributed import remote
 from stages.distributed.batch import WAITING, BatchTable, Row, run_names, running_stage
 from stages.distributed.cluster import open_executor
 from stages.distributed.tasks import TaskResult, resources_of, task_for
@@ -44,8 +45,6 @@ def batch(
     A capture that fails does not stop the others; the exit status is the worst. The same command
     again goes on where it stopped: what is finished is not done twice. batch.csv lists the results.
     """
-    from stages.distributed import remote
-
     settings = run_settings.of_new_run(options.given_only(given))
     log.write_settings(settings)
     runs = remote.parse_location(out)

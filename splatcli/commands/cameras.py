@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from splatcli import console
 from stages.base.atomic import make_folder
 from stages.base.errors import SplatError, UsageError
+from stages.cameras import colmap, nerfstudio
+from stages.cameras.camera_file import NO_POINTS, CameraFile
+from stages.cameras.table import read_cameras
 from stages.run import runfolder
 from stages.run.pipeline import Pipeline
-
-if TYPE_CHECKING:
-    from stages.cameras.camera_file import CameraFile
 
 
 def cameras(
@@ -31,10 +31,6 @@ def cameras(
     A run's cameras belong to its undistorted photographs, which the file names; sparse points are
     written with them. nerfstudio's world is z up; COLMAP's is y down, as in a run.
     """
-    from stages.cameras import colmap, nerfstudio
-    from stages.cameras.camera_file import NO_POINTS
-    from stages.cameras.table import read_cameras
-
     to_nerfstudio = _is_json(out)
     source = _model_of_run(source) if runfolder.is_run_folder(source) else source
     model = colmap.locate(source)

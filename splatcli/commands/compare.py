@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from splatcli import console
 from splatcli.folders import find_run_folder
+from stages.base.atomic import make_folder
 from stages.base.errors import UsageError
 from stages.run import results
 from stages.run.pipeline import Pipeline
 from stages.run.planning import PHOTOS
-
-if TYPE_CHECKING:
-    from stages.tradeoff.comparison import Candidate
+from stages.tradeoff.comparison import (
+    Candidate,
+    compare_runs,
+    distinct_name,
+    fact_rows,
+    verdict_lines,
+    write_comparison,
+)
 
 
 def compare(
@@ -29,15 +35,6 @@ def compare(
 
     Both are evaluated at one size, view by view, on photographs that neither was trained on.
     """
-    from stages.base.atomic import make_folder
-    from stages.tradeoff.comparison import (
-        compare_runs,
-        distinct_name,
-        fact_rows,
-        verdict_lines,
-        write_comparison,
-    )
-
     runs = [Pipeline(find_run_folder(folder)) for folder in (first, second)]
     sides = [
         _side(run, distinct_name(run.run_folder, other.run_folder))
@@ -83,8 +80,6 @@ def _check_photographs(first: Pipeline, second: Pipeline) -> None:
 
 
 def _side(run: Pipeline, name: str) -> Candidate:
-    from stages.tradeoff.comparison import Candidate
-
     splats = results.final_splats(run)
     facts = {"splats": f"{len(splats):,}", "SH degree": str(splats.sh_degree)}
     trained = run.manifest("train")

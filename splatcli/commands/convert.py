@@ -6,17 +6,23 @@ import contextlib
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
 from splatcli import console
 from splatcli.arguments import ENDINGS
+from stages import formats
+from stages.base import scratch
+from stages.base.atomic import make_folder
+from stages.base.blocks import progress_reported_to
 from stages.base.errors import UsageError
+from stages.formats import format_of
+from stages.formats.losses import losses_of
+from stages.proof.prover import Prover, cameras_for, losses_shown
 from stages.run import results
-
-if TYPE_CHECKING:
-    from stages.scene import Splats
+from stages.scene import Splats
 
 _STEPS = 3
 
@@ -29,11 +35,6 @@ def convert(
 
     The new file is read with a second parser, drawn and compared with the first.
     """
-    from stages import formats
-    from stages.base import scratch
-    from stages.base.atomic import make_folder
-    from stages.formats.losses import losses_of
-
     rows = formats.format_of(source), formats.format_of(target)  # before any work is done
     begun = time.monotonic()
     # the folder of the target is made once there is something to write
@@ -76,8 +77,6 @@ def convert(
 
 def _refuse_nothing(source: Path, target: Path, splats: Splats) -> None:
     """Raise SplatError "convert-nothing" where the new file would have no bytes at all."""
-    from stages.formats import format_of
-
     if format_of(target).ending == "splat" and not len(splats):
         raise UsageError(
             "convert-nothing",
@@ -99,9 +98,6 @@ def _show(facts: dict[str, Any], found: dict[str, Any]) -> None:
 def _proven(source: Path, target: Path, splats: Splats) -> tuple[dict[str, Any], str]:
     """(the figures of the comparison, a warning of what was lost or "").
     Raises SplatError "convert-verify-failed"."""
-    from stages.formats import format_of
-    from stages.proof.prover import Prover, cameras_for, losses_shown
-
     cameras = cameras_for(splats, results.views_of(results.run_around(source)))
     prover = Prover.of(splats, cameras, source_format=format_of(source).ending)
     proof = prover.require(target, "convert-verify-failed")
@@ -116,10 +112,6 @@ def _proven(source: Path, target: Path, splats: Splats) -> tuple[dict[str, Any],
 def _progress() -> Iterator[Callable[[str], None]]:
     """Yield a function to call at the beginning of each step. It prints a line or an event; on a
     terminal it shows a bar with the progress of the step."""
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
-
-    from stages.base.blocks import progress_reported_to
-
     done, shown = 0, console.mode.has_notes and console.err.is_terminal
     columns = TextColumn("{task.description}", markup=False), BarColumn(24), TaskProgressColumn()
     bar = Progress(*columns, console=console.err, transient=True, disable=not shown)

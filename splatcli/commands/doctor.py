@@ -12,6 +12,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 
 import typer
+from PIL import Image
 
 from splatcli import console
 from stages.base import threads
@@ -20,7 +21,11 @@ from stages.base.errors import Family
 from stages.base.libraries import modules_of, needed, versions
 from stages.base.memory import available_mib
 from stages.base.text import counted, reason_of
+from stages.cameras.table import CAMERA_FILES
+from stages.ingest.decode import FORMATS, readers_set_up
 from stages.raster.backends import AUTO, BACKENDS, Backend, backend_of
+from stages.raster.gpu import device
+from stages.raster.kernels import cache
 
 _LITTLE_MEMORY_MIB = 2048.0
 _LITTLE_DISK_BYTES = 2_000_000_000
@@ -107,8 +112,6 @@ def _attempted(name: str, value: Callable[[], str], needed: bool = True) -> Chec
 
 def _kernel_cache() -> str:
     """The folder and its size. Raises if there is no place to write to, or no Numba."""
-    from stages.raster.kernels import cache
-
     own, others = cache.folder(), cache.others()
     value = f"{own}, {console.size(cache.size_bytes(own))}"
     if others:
@@ -119,17 +122,11 @@ def _kernel_cache() -> str:
 
 def _gpu() -> str:
     """The GPU, also if torch cannot use it."""
-    from stages.raster.gpu import device
-
     missing = device.missing()
     return f"{missing}; {device.built()}" if missing else device.describe()
 
 
 def _photograph_formats() -> str:
-    from PIL import Image
-
-    from stages.ingest.decode import FORMATS, readers_set_up
-
     with readers_set_up():
         return ", ".join(name for name in FORMATS if name in Image.OPEN)
 
@@ -141,8 +138,6 @@ def _video_codecs() -> str:
 
 
 def _camera_files() -> str:
-    from stages.cameras.table import CAMERA_FILES
-
     return ", ".join(row.description for row in CAMERA_FILES)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -13,13 +13,21 @@ from splatcli import console
 from splatcli.arguments import ENDINGS
 from splatcli.folders import load_target
 from splatcli.operation_options import parsed_operations
+from stages import formats
+from stages.base import scratch
+from stages.base.atomic import make_folder
 from stages.base.errors import UsageError
 from stages.base.text import counted
+from stages.editing import levels, operations
+from stages.editing.scene import EditedScene
+from stages.editing.syntax import ParsedOperation
+from stages.evaluate.evaluation import load_evaluation_views
+from stages.formats import format_of, units_of
+from stages.formats.losses import losses_of
+from stages.formats.values import drop_undrawable
+from stages.proof.prover import Prover, cameras_for
 from stages.run import results
-
-if TYPE_CHECKING:
-    from stages.editing.scene import EditedScene
-    from stages.editing.syntax import ParsedOperation
+from stages.scene import split_held_out
 
 
 def edit(
@@ -60,12 +68,6 @@ def _edit(
     source: Path, target: Path, parsed: Sequence[ParsedOperation], dry_run: bool
 ) -> dict[str, Any]:
     """Apply the operations and write `target`. Returns figures: splats, steps, PSNR, bytes."""
-    from stages import formats
-    from stages.base import scratch
-    from stages.base.atomic import make_folder
-    from stages.editing import levels, operations
-    from stages.formats.losses import losses_of
-
     row, prepared = formats.format_of(target), operations.prepare_operations(parsed, target)
     if not dry_run:
         make_folder(target.parent)
@@ -101,12 +103,6 @@ def _edit(
 def _load_scene(source: Path, antialias: bool) -> tuple[EditedScene, int]:
     """(the splats that can be drawn, with the photographs of their run if there is one; the number
     of others). antialias: whether they may be for antialiased drawing. Raises SplatError."""
-    from stages.editing.scene import EditedScene
-    from stages.evaluate.evaluation import load_evaluation_views
-    from stages.formats import units_of
-    from stages.formats.values import drop_undrawable
-    from stages.scene import split_held_out
-
     splats, pipeline = load_target(source, strict=False, antialias=antialias)
     pipeline = pipeline or results.run_around(source)
     splats, dropped = drop_undrawable(splats)
@@ -128,10 +124,6 @@ def _load_scene(source: Path, antialias: bool) -> tuple[EditedScene, int]:
 def _proven(source: Path, target: Path, scene: EditedScene) -> dict[str, Any]:
     """The figures of comparing `target`, read by a second parser, with the splats. Raises
     SplatError "edit-verify-failed"."""
-    from stages.formats import format_of
-    from stages.formats.values import drop_undrawable
-    from stages.proof.prover import Prover, cameras_for
-
     splats = drop_undrawable(scene.splats)[0]
     source_format = format_of(source).ending if source.is_file() else ""
     cameras = cameras_for(splats, scene.placed_views())

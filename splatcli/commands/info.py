@@ -4,20 +4,33 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from splatcli import console
 from splatcli.arguments import RunOrFile
 from splatcli.folders import load_target
+from stages.base import scratch
+from stages.evaluate.evaluation import seconds_per_frame
+from stages.formats import format_of
+from stages.proof.checks import byte_breakdown_of
+from stages.proof.statistics import (
+    DEGREES,
+    GIANT_PART,
+    NEEDLE_ASPECT,
+    OUTLIER_BOXES,
+    Statistics,
+    floats_of,
+    mass_within,
+    memory_of,
+    statistics_of,
+)
 from stages.raster.backends import backend_of
 from stages.run import results
 from stages.run.pipeline import Pipeline
-
-if TYPE_CHECKING:
-    from stages.proof.statistics import Statistics
-    from stages.scene import ExportedFile, Splats
+from stages.scene import ExportedFile, Splats
+from stages.scene.framing import orbit_cameras
 
 _ATTRIBUTES = {
     "means": "positions",
@@ -37,9 +50,6 @@ def info(
     ] = False,
 ) -> None:
     """Print statistics of a file or a run: splats, SH degrees, bounds, bytes, and warnings."""
-    from stages.base import scratch
-    from stages.proof.statistics import statistics_of
-
     with scratch.scratch_in(Path(tempfile.gettempdir()), spare=True):
         splats, pipeline = load_target(target, strict=False)
         statistics = statistics_of(splats)
@@ -86,8 +96,6 @@ def describe(splats: Splats, statistics: Statistics) -> dict[str, Any]:
 def _memory(splats: Splats) -> dict[str, Any]:
     """Floats and bytes in memory for each splat and for all, and the mass of a Gaussian within 1, 2
     and 3 standard deviations."""
-    from stages.proof.statistics import DEGREES, floats_of, mass_within, memory_of
-
     one, every = (memory_of(splats.sh_degree, count) for count in (1, len(splats)))
     return {
         "floats_per_splat": floats_of(splats.sh_degree),
@@ -101,9 +109,6 @@ def _memory(splats: Splats) -> dict[str, Any]:
 def _speed(splats: Splats, pipeline: Pipeline | None) -> dict[str, Any]:
     """Frames a second from some of the photographs' cameras, at the size of the training; from
     cameras around the splats if there are no photographs."""
-    from stages.evaluate.evaluation import seconds_per_frame
-    from stages.scene.framing import orbit_cameras
-
     console.note_compiling()
     views = results.views_of(pipeline)
     chosen = views[:: max(1, len(views) // _TIMED_FRAMES)][:_TIMED_FRAMES]
@@ -123,8 +128,6 @@ def _speed(splats: Splats, pipeline: Pipeline | None) -> dict[str, Any]:
 
 def warnings_of(statistics: Statistics) -> list[tuple[str, str]]:
     """(code, sentence) for each kind of defect that is there."""
-    from stages.proof.statistics import GIANT_PART, NEEDLE_ASPECT, OUTLIER_BOXES
-
     found = []
     for name, count in statistics.not_finite.items():
         what = f"{_share(count, statistics)} not finite in their {_ATTRIBUTES[name]}"
@@ -150,9 +153,6 @@ def _share(count: int, statistics: Statistics) -> str:
 
 
 def _about_file(path: Path, count: int) -> dict[str, Any]:
-    from stages.formats import format_of
-    from stages.proof.checks import byte_breakdown_of
-
     size = format_of(path).size_bytes(path)
     facts: dict[str, Any] = {"file": str(path), "size_bytes": size}
     breakdown = byte_breakdown_of(path)

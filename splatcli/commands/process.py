@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 from splatcli import console, log, options, progress, run_settings, summary
 from splatcli.arguments import Cluster, Out, Photos, Run
 from splatcli.folders import DEFAULT, find_run_folder
-from stages import STAGE_NAMES
 from stages.base.errors import UsageError
 from stages.base.settings import changed
-from stages.distributed import blocks, cluster, sfm_chunks
-from stages.distributed.tasks import Executor
+from stages.cameras.table import read_cameras
 from stages.run import runfolder
 from stages.run.attempt import Listeners
 from stages.run.pipeline import Listener, Pipeline
 from stages.run.precompile import PrecompileListener
 from stages.run.runfile import RunFile
+from stages.run.stages import STAGE_NAMES
+from stages.sfm.known.match_cameras import check_split
+from stages.viewer.live_training import LiveTraining
+from stages.viewer.server import open_in_browser
 
 
 def process(
@@ -33,11 +34,10 @@ def process(
 
     Finished work is kept: after an interruption the same command goes on where it stopped.
     """
-    from stages.cameras.table import read_cameras
-    from stages.sfm.known.match_cameras import check_split
+    from splatcli.distribution import distributed  # loads training, which `--help` does not need
 
     run_folder, photos = _run_folder_and_photos(photos, out)
-    pipeline = distribute(Pipeline(run_folder, photos), cluster)
+    pipeline = distributed(Pipeline(run_folder, photos), cluster)
     given = options.given_only(given)
     view, preset = given.pop("view", False), given.pop("preset", None)
     is_known = runfolder.is_run_folder(run_folder)
@@ -86,6 +86,8 @@ def _run_folder_and_photos(photos: Path | None, out: Path | None) -> tuple[Path,
 def _run_stage(name: str, pipeline: Pipeline, given: Mapping[str, Any]) -> None:
     """One stage, with the recorded settings and the given options. The stages after training take
     little time: those that are missing in between run too."""
+    from splatcli.distribution import distributed  # loads training, which `--help` does not need
+
     is_known = runfolder.is_run_folder(pipeline.run_folder)
     base = run_settings.recorded(pipeline)
     given = options.given_only(given)
@@ -106,7 +108,7 @@ def _run_stage(name: str, pipeline: Pipeline, given: Mapping[str, Any]) -> None:
         console.note(run_settings.training_summary(settings["train"], given, preset))
     after_training = STAGE_NAMES[STAGE_NAMES.index("train") + 1 :]
     _run(
-        distribute(pipeline, None),
+        distributed(pipeline),
         settings,
         until=name,
         may_run=after_training if name in after_training else (name,),
@@ -119,19 +121,6 @@ def _with_exported(pipeline: Pipeline, formats: Collection[str]) -> tuple[str, .
     manifest = pipeline.manifest("export")
     earlier = manifest.settings.get("formats", ()) if manifest is not None else ()
     return tuple(dict.fromkeys((*earlier, *formats)))
-
-
-def distribute(pipeline: Pipeline, address: str | None) -> Pipeline:
-    """The pipeline, which trains blocks on the cluster at `address`, or in this process without
-    one. A cluster computes chunks of features and matches, too."""
-
-    def open_executor(folder: Path, listener: Listener) -> AbstractContextManager[Executor]:
-        paths = filter(None, [pipeline.run_folder, pipeline.photos or pipeline.recorded_photos()])
-        return cluster.open_executor(address, folder, paths, listener)
-
-    if address is not None:
-        pipeline = sfm_chunks.with_chunks(pipeline, open_executor)
-    return blocks.in_blocks(pipeline, open_executor)
 
 
 def _run(
@@ -160,9 +149,6 @@ def _run(
 
 
 def _live_training(pipeline: Pipeline) -> Listener:
-    from stages.viewer.live_training import LiveTraining
-    from stages.viewer.server import open_in_browser
-
     def announce(address: str) -> None:
         if console.mode.as_json:
             console.emit("view", address=address)

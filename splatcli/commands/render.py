@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -19,11 +19,15 @@ from splatcli.options import number
 from splatcli.progress import counting
 from stages.base import memory
 from stages.base.errors import ResourceError, SplatError, UsageError
+from stages.raster.backends import AUTO, qualified_name
+from stages.raster.definition import Rendering
+from stages.raster.draw import renderer, supersampled
+from stages.raster.torch_device import CPU
 from stages.run import results
-
-if TYPE_CHECKING:
-    from stages.raster.definition import Rendering
-    from stages.scene import Camera, Splats, View
+from stages.scene import Camera, Splats, View
+from stages.viewer import sinks
+from stages.viewer.render_cameras import Duration, camera_of_view, path_cameras
+from stages.viewer.sinks import frames_beyond
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp")
 _BYTES_PER_PIXEL = 100  # colour and depth planes, their copies, and the tiles' lists
@@ -133,10 +137,6 @@ def _render(
     target: Path | None, options: _Options, kind: str, backend: str | None, device: str | None
 ) -> dict[str, Any]:
     """Draw and write the pictures. Returns figures: frames, size, depth range, times."""
-    from stages.raster.backends import AUTO, qualified_name
-    from stages.raster.draw import renderer, supersampled
-    from stages.raster.torch_device import CPU
-
     begun = time.monotonic()
     splats, pipeline = load_target(target)
     run = pipeline or results.run_around(target)
@@ -159,8 +159,6 @@ def _render(
 
 def _cameras(splats: Splats, views: tuple[View, ...], options: _Options, kind: str) -> list[Camera]:
     """One camera for each frame; for a film, all of one even size. Raises SplatError."""
-    from stages.viewer.render_cameras import Duration, camera_of_view, path_cameras
-
     if kind == "picture":
         return [_resized(camera_of_view(splats, views, options.camera), options.width)]
     duration = Duration(options.frames, options.seconds, options.fps)
@@ -198,8 +196,6 @@ def _sink(
     options: _Options, kind: str, draw: Callable[[Camera], Rendering], cameras: list[Camera]
 ) -> tuple[AbstractContextManager[Callable[[Rendering], None]], dict[str, Any]]:
     """(what writes the renderings, the depth range of a film with depth)."""
-    from stages.viewer import sinks
-
     if kind == "folder":
         return sinks.folder_sink(options.out, len(cameras), options.depth), {}
     if kind == "picture":
@@ -229,8 +225,6 @@ def _draw_all(
 
 
 def _warn_of_other_frames(folder: Path, frames: int) -> None:
-    from stages.viewer.sinks import frames_beyond
-
     if left := frames_beyond(folder, frames):
         console.note(f"Warning: {left} frames of an earlier, longer path are still there.")
 

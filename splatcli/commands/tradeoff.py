@@ -4,20 +4,23 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from splatcli import console
 from splatcli.arguments import Run
 from splatcli.folders import find_run_folder
+from stages.base.atomic import make_folder
 from stages.base.errors import UsageError
+from stages.base.stage import Report
+from stages.evaluate.evaluation import load_evaluation_views
+from stages.prune.stage import pruner_of
 from stages.run import results
 from stages.run.pipeline import Pipeline
-
-if TYPE_CHECKING:
-    from stages.scene import Splats
-    from stages.tradeoff.measurement import TradeoffInputs
+from stages.scene import Splats, split_held_out
+from stages.tradeoff.measurement import TradeoffInputs, floater_views, measure_tradeoff
+from stages.tradeoff.report import summarise, write_report
 
 
 def tradeoff(
@@ -33,10 +36,6 @@ def tradeoff(
     really written and read, and the trained splats are pruned to several numbers, as `splat prune
     --max-splats` does.
     """
-    from stages.base.atomic import make_folder
-    from stages.tradeoff.measurement import measure_tradeoff
-    from stages.tradeoff.report import summarise, write_report
-
     pipeline = Pipeline(find_run_folder(run))
     inputs = _inputs(pipeline)
     folder = out or pipeline.run_folder / "tradeoff"
@@ -59,12 +58,6 @@ def tradeoff(
 def _inputs(pipeline: Pipeline) -> TradeoffInputs:
     """The splats, views and files to measure, of a finished run. Raises SplatError
     (stage-not-finished, run-half-anew, nothing-held-out)."""
-    from stages.base.stage import Report
-    from stages.evaluate.evaluation import load_evaluation_views
-    from stages.prune.stage import pruner_of
-    from stages.scene import split_held_out
-    from stages.tradeoff.measurement import TradeoffInputs, floater_views
-
     splats = results.final_splats(pipeline)
     settings = splats.draw_settings
     reconstruction = results.reconstruction_of(pipeline)

@@ -6,19 +6,22 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from splatcli import console
 from splatcli.folders import find_run_folder
+from stages import formats
 from stages.base.errors import QualityError, UsageError
+from stages.formats import format_of
+from stages.formats.mesh_table import MESHES
+from stages.formats.sog_quantisation import splats_to_write
+from stages.formats.values import drop_undrawable
+from stages.proof.prover import Proof, Prover, cameras_for, provers_of
 from stages.run import results, runfolder
 from stages.run.pipeline import Pipeline
-
-if TYPE_CHECKING:
-    from stages.proof.prover import Proof, Prover
-    from stages.scene import QuantisedSplats, Splats, View
+from stages.scene import QuantisedSplats, Splats, View
 
 _ITSELF = "itself"
 _ONLY_ITSELF = (
@@ -61,8 +64,6 @@ def verify(
     A file outside a run, without --against, is compared with itself: two parsers that share no
     code must read the same. Exit status 7 if a file is wrong.
     """
-    from stages import formats
-
     files = _files(target)
     for file in files:
         formats.format_of(file)  # raises before any work is done
@@ -89,8 +90,6 @@ def verify(
 
 def _files(target: Path | None) -> list[Path]:
     """The file itself, or the exported files of a run except meshes, which hold no splats."""
-    from stages.formats.mesh_table import MESHES
-
     if target is not None and not target.is_dir():
         return [target]
     pipeline = Pipeline(find_run_folder(target))
@@ -109,8 +108,6 @@ def _files(target: Path | None) -> list[Path]:
 
 def _original(file: Path, against: Path | None, read: Splats) -> _Original:
     """read: what our own reader finds in `file`."""
-    from stages import formats
-
     if against is not None and not against.is_dir():
         around = (results.run_around(path) for path in (against, file))
         views = next(filter(None, map(results.views_of, around)), ())
@@ -125,10 +122,6 @@ def _original(file: Path, against: Path | None, read: Splats) -> _Original:
 
 def _of_file(name: str, file: Path, read: Splats, views: tuple[View, ...] = ()) -> _Original:
     """read: the splats of `file`. views: of the capture, if it is known."""
-    from stages.formats import format_of
-    from stages.formats.values import drop_undrawable
-    from stages.proof.prover import Prover, cameras_for
-
     splats = drop_undrawable(read)[0]
     cameras = cameras_for(splats, views)
     prover = Prover.of(splats, cameras, source_format=format_of(file).ending)
@@ -138,11 +131,6 @@ def _of_file(name: str, file: Path, read: Splats, views: tuple[View, ...] = ()) 
 def _of_run(run: Pipeline) -> _Original:
     """The splats that the run's export writes to a file, which may be fine-tuned for its format,
     then those that a conversion would write."""
-    from stages.formats import format_of
-    from stages.formats.sog_quantisation import splats_to_write
-    from stages.formats.values import drop_undrawable
-    from stages.proof.prover import cameras_for, provers_of
-
     quantised: QuantisedSplats = run.load("quantise")
     cameras = cameras_for(drop_undrawable(quantised.splats)[0], run.load("sfm").views)
     prover_of = provers_of(quantised, cameras, results.backend_of_run(run))
@@ -157,8 +145,6 @@ def _of_run(run: Pipeline) -> _Original:
 
 
 def _facts(file: Path, proof: Proof, original: _Original) -> dict[str, Any]:
-    from stages.formats import format_of
-
     row = format_of(file)
     size = row.size_bytes(file)
     return {
@@ -233,8 +219,6 @@ def _label(name: str) -> str:
 
 
 def _why(file: Path) -> str:
-    from stages.formats import format_of
-
     why = format_of(file).loses
     return f"The format {why}." if why else "The original had lost more already."
 

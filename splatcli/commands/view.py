@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -16,14 +16,15 @@ from splatcli import console
 from splatcli.arguments import RunOrFile
 from splatcli.folders import load_target
 from splatcli.options import number
-from stages.base import interrupt
+from stages.base import interrupt, scratch
 from stages.base.errors import SplatError, UsageError
+from stages.formats import format_of, ply
+from stages.formats.values import drop_undrawable
 from stages.run import results
 from stages.run.pipeline import Pipeline
-
-if TYPE_CHECKING:
-    from stages.scene import Splats
-    from stages.viewer.server import Item, LocalServer
+from stages.scene import Splats
+from stages.viewer.server import Item, LocalServer, open_in_browser
+from stages.viewer.site import site
 
 
 def view(
@@ -40,10 +41,6 @@ def view(
 
     The page is served to this machine only and needs no network. Ctrl-C ends it.
     """
-    from stages.base import scratch
-    from stages.formats.values import drop_undrawable
-    from stages.viewer.server import LocalServer
-
     with one_signal_stops(), tempfile.TemporaryDirectory(prefix="splat-view-") as folder:
         with scratch.scratch_in(Path(folder), spare=True):
             splats, pipeline = load_target(target)
@@ -76,9 +73,6 @@ def _items(
 ) -> dict[str, Item]:
     """The items to serve. The splats are written to `content` as .ply, which the page reads best;
     a streamed asset is served as it is."""
-    from stages.formats import format_of, ply
-    from stages.viewer.site import site
-
     run = pipeline or results.run_around(target)
     sfm = run.load("sfm") if run is not None and run.manifest("sfm") is not None else None
     units = sfm.units if sfm else "arbitrary"
@@ -97,8 +91,6 @@ def _title(target: Path | None, pipeline: Pipeline | None) -> str:
 
 
 def _serve(server: LocalServer, count: int, open_browser: bool) -> None:
-    from stages.viewer.server import open_in_browser
-
     try:
         console.out.print(server.address)
         console.note(f"{count:,} splats. Ctrl-C ends it.")

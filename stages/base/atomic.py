@@ -13,6 +13,8 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+import psutil
+
 from stages.base.disk import DISK_FULL, disk_full, is_full
 from stages.base.errors import ResourceError, SplatError
 
@@ -32,8 +34,6 @@ def _machine() -> str:
 
 def remove_abandoned_files(folder: Path) -> None:
     """Delete incomplete files in `folder` whose process, on this machine, has ended."""
-    import psutil
-
     partial = re.compile(re.escape(f"{_PARTIAL}{_machine()}-") + r"(\d+)-")
     with suppress(OSError, OverflowError):  # tidying up must not stop the work
         for path in list(folder.iterdir()):

@@ -14,21 +14,19 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
+import psutil
+
 MIB = 1024.0 * 1024.0
 _SELF = Path("/proc/self")
 
 
 def available_mib() -> float:
     """Memory that can be allocated without swapping, MiB."""
-    import psutil
-
     return float(psutil.virtual_memory().available) / MIB
 
 
 def resident_mib(pid: int | None = None) -> float:
     """Resident memory of a process (by default this one), MiB; 0 if it has ended."""
-    import psutil
-
     try:
         return float(psutil.Process(pid).memory_info().rss) / MIB
     except psutil.Error:
@@ -37,8 +35,6 @@ def resident_mib(pid: int | None = None) -> float:
 
 def descendants(pid: int | None = None) -> list[int]:
     """Process ids of the children of a process (by default this one), their children and so on."""
-    import psutil
-
     try:
         return [child.pid for child in psutil.Process(pid).children(recursive=True)]
     except psutil.Error:

@@ -6,6 +6,7 @@ A stage knows nothing of manifests, skipping or the terminal. Tests call `stage.
 
 from __future__ import annotations
 
+import importlib
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -66,6 +67,10 @@ class Report:
             self.preview(draw)
 
 
+Run: TypeAlias = Callable[[Mapping[str, Any], Any, Path, Report], Any]
+Load: TypeAlias = Callable[[Path], Any]
+
+
 @dataclass(frozen=True)
 class Stage:
     """The description of one stage of the pipeline.
@@ -85,5 +90,18 @@ class Stage:
     version: int
     reads: tuple[str, ...]
     settings_type: type
-    run: Callable[[Mapping[str, Any], Any, Path, Report], Any]
-    load: Callable[[Path], Any]
+    run: Run
+    load: Load
+
+
+def in_module(module: str) -> dict[str, Any]:
+    """The arguments `run` and `load` of a `Stage`: functions of a module that is imported when one
+    of them is called. Help, planning and status must not wait for NumPy and torch."""
+
+    def run(*given: Any) -> Any:
+        return importlib.import_module(module).run(*given)
+
+    def load(folder: Path) -> Any:
+        return importlib.import_module(module).load(folder)
+
+    return {"run": run, "load": load}

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from stages.base.bad_files import BadFileError
 from stages.cameras.lens import Lens
@@ -213,8 +214,6 @@ def picture_beside(path: Path) -> Path | None:
 
 def stored_size(path: Path) -> tuple[int, int]:
     """(width, height) of a picture. Raises BadFileError if it is none."""
-    from PIL import Image
-
     try:
         with Image.open(path) as picture:
             return picture.size

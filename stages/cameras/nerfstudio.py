@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from plyfile import PlyData, PlyElement
 
 from stages.base.atomic import replacing
 from stages.base.bad_files import CAMERAS, BadFileError, reading
@@ -280,8 +281,6 @@ def _seen_from(folder: Path, picture: Path) -> str:
 
 
 def _write_points(path: Path, points: NDArray[np.float64], colours: NDArray[np.uint8]) -> None:
-    from plyfile import PlyData, PlyElement
-
     names = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
     rows = np.empty(len(points), names)
     for axis, name in enumerate("xyz"):

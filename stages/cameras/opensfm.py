@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from stages.base.bad_files import CAMERAS, BadFileError, reading
 from stages.cameras.camera_file import (
@@ -134,6 +135,4 @@ def optics_of(camera: Mapping[str, Any]) -> tuple[list[float], Lens]:
 
 def rotations_of(turns: NDArray[np.float64]) -> NDArray[np.float64]:
     """[V, 3, 3] of axis-angle vectors [V, 3]."""
-    from scipy.spatial.transform import Rotation
-
     return np.asarray(Rotation.from_rotvec(turns).as_matrix())

@@ -17,6 +17,7 @@ from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from stages.base.bad_files import CAMERAS, BadFileError, reading
 from stages.cameras.camera_file import (
@@ -147,8 +148,6 @@ def _optics(internals: dict[str, Any], size: Any) -> tuple[list[float], Lens]:
 
 def _world_to_camera(angles: NDArray[np.float64]) -> NDArray[np.float64]:
     """[V, 3, 3], with our axes of the camera, of omega, phi and kappa [V, 3], degrees."""
-    from scipy.spatial.transform import Rotation
-
     to_world = Rotation.from_euler("XYZ", angles, degrees=True).as_matrix()
     return np.asarray(OPENGL_FROM_OURS @ to_world.transpose(0, 2, 1))
 

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from stages.base.bad_files import CAMERAS, BadFileError, reading
 from stages.base.text import reason_of
@@ -78,7 +79,5 @@ def _optics(row: dict[str, str], width: int, height: int) -> Optics:
 
 def _world_to_camera(angles: NDArray[np.float64]) -> NDArray[np.float64]:
     """[V, 3, 3], with our axes of the camera, of heading, pitch and roll [V, 3], degrees."""
-    from scipy.spatial.transform import Rotation
-
     to_world = Rotation.from_euler("ZXY", angles * (-1, 1, 1), degrees=True).as_matrix()
     return np.asarray(OPENGL_FROM_OURS @ to_world.transpose(0, 2, 1))

@@ -9,13 +9,13 @@ from contextlib import suppress
 from dataclasses import astuple, dataclass, fields, replace
 from pathlib import Path
 
-from stages import STAGE_NAMES
 from stages.base.atomic import write_csv
 from stages.base.errors import SplatError, UsageError
 from stages.distributed import remote
 from stages.distributed.remote import Location
 from stages.distributed.tasks import TaskResult
 from stages.run.manifest import Manifest
+from stages.run.stages import STAGE_NAMES
 
 FILE_NAME = "batch.csv"
 WAITING, DONE = "waiting", "done"

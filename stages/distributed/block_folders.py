@@ -10,16 +10,15 @@ import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from stages.base.libraries import versions
 from stages.run.digests import combined_digest, record_files
 from stages.run.manifest import MANIFEST, Manifest
 from stages.run.pipeline import Pipeline
 from stages.run.runfile import RunFile
-
-if TYPE_CHECKING:
-    from stages.scene import Reconstruction, Splats
+from stages.scene import Reconstruction, Splats, save_splats
+from stages.sfm.reconstruction_files import save_reconstruction
 
 _POINTS = 100_000  # at most, of the sparse cloud, which only tells the extent of the scene
 
@@ -38,9 +37,6 @@ def begin(
 
     Raises SplatError, OSError.
     """
-    from stages.scene import save_splats
-    from stages.sfm.reconstruction_files import save_reconstruction
-
     folder.mkdir(parents=True, exist_ok=True)
     pipeline = Pipeline(folder)
     ingest = _of(whole, "ingest")

@@ -15,22 +15,35 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from stages.base.errors import UsageError
 from stages.base.stage import Numbers, Report, Stage
 from stages.base.text import counted
-from stages.distributed import block_folders
+from stages.distributed import block_folders, merge, partition
+from stages.distributed.partition import Cell
 from stages.distributed.tasks import Executor, OpenExecutor, RunTask, resources_of, run_all
+from stages.evaluate.evaluation import image_renderer, load_evaluation_views
 from stages.raster.backends import backend_of_settings
 from stages.run.pipeline import Listener, Pipeline
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from stages.distributed.partition import Cell
-    from stages.scene import DrawSettings, Reconstruction, Splats, TrainedSplats, View
+from stages.scene import (
+    DrawSettings,
+    Reconstruction,
+    Splats,
+    TrainedSplats,
+    View,
+    draw_settings_of,
+    split_held_out,
+    training_extent,
+)
+from stages.train.build import corrects_light, corrects_vignetting
+from stages.train.dropout import uses_dropout
+from stages.train.finetune import FineTuner
+from stages.train.quality import write_history, write_quality
+from stages.train.stage import save
 
 FOLDER, COARSE = "blocks", "coarse"
 VIEWS_PER_BLOCK = 250
@@ -81,11 +94,6 @@ class _BlockTraining:
 
     def train(self, blocks: int, seeds: Splats, folder: Path) -> TrainedSplats:
         """The merged splats, written to `folder` as training writes them."""
-        from stages.distributed import partition
-        from stages.scene import draw_settings_of, split_held_out
-        from stages.train.build import corrects_light, corrects_vignetting
-        from stages.train.stage import save
-
         started = time.monotonic()
         light = corrects_light(self.whole, self.settings.light, self.report)
         vignetting = corrects_vignetting(self.whole, self.settings.light, self.report)
@@ -120,9 +128,6 @@ class _BlockTraining:
         return trained
 
     def _evaluate(self, splats: Splats, held: Sequence[View], folder: Path) -> None:
-        from stages.evaluate.evaluation import image_renderer, load_evaluation_views
-        from stages.train.quality import write_history, write_quality
-
         settings = splats.draw_settings
         views = load_evaluation_views(self.whole.folder, held, settings)
         render = image_renderer(splats, backend_of_settings(self.settings))
@@ -205,9 +210,6 @@ class _BlockTraining:
         self, splats: Splats, cell: Cell, most: int, views: Sequence[View]
     ) -> NDArray[np.bool_]:
         """[N] which of a block's splats go into the merged scene: at most `most` of its cell."""
-        from stages.distributed import merge
-        from stages.evaluate.evaluation import load_evaluation_views
-
         own = cell.holds(splats.means)
         if own.sum() <= most:
             return own
@@ -222,8 +224,6 @@ class _BlockTraining:
     ) -> int:
         """Make a block's run folder. Returns the maximum of its splats, background included: its
         fraction of the scene's maximum is the coarse model's fraction in its cell."""
-        from stages.distributed import merge
-
         inside = int(wide.holds(coarse.means).sum())
         own = max(1, round(self.settings.max_splats * inside / len(coarse)))
         start = merge.initial_splats(seeds, coarse, wide, own)
@@ -259,14 +259,6 @@ class _BlockTraining:
     ) -> TrainedSplats:
         """The blocks as one model, block after block, whose seams are fine-tuned on `seam_views`.
         training_views: how many the whole scene has."""
-        import numpy as np
-
-        from stages.distributed import merge
-        from stages.evaluate.evaluation import load_evaluation_views
-        from stages.scene import TrainedSplats, training_extent
-        from stages.train.dropout import uses_dropout
-        from stages.train.finetune import FineTuner
-
         degree, backend = self.settings.sh_degree, backend_of_settings(self.settings)
         splats, counts = merge.merge_blocks(
             [part.with_sh_degree(degree) for part in parts], cells, draw_settings
@@ -305,8 +297,6 @@ class _BlockProgress(Listener):
 
 def _with_roles(whole: Reconstruction) -> Reconstruction:
     """With a role for each view, so that no block trains on another block's held-out views."""
-    from stages.scene import split_held_out
-
     _, held = split_held_out(whole.views)
     names = {view.name for view in held}
     if not names:

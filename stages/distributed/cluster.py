@@ -18,7 +18,6 @@ from pathlib import Path
 from threading import Event
 from typing import Any
 
-from stages import STAGE_NAMES, load_stage
 from stages.base.distribution import NAME, VERSION, install_command
 from stages.base.errors import Family, Interrupted, ResourceError, SplatError, UsageError
 from stages.distributed.remote import Location
@@ -31,6 +30,7 @@ from stages.distributed.tasks import (
     run_task,
 )
 from stages.run.pipeline import Listener
+from stages.run.stages import STAGE_NAMES, STAGE_OF
 
 _LOCAL = re.compile(r"local:([1-9]\d{0,3})")
 _ADDRESS = re.compile(r"(?:ray://)?([^/:\s]+):(\d{1,5})")
@@ -43,7 +43,7 @@ _MIB = 1024 * 1024
 def edition() -> str:
     """The version of the project and of its stages. Workers with another edition could write other
     bytes."""
-    stages = ".".join(str(load_stage(name).version) for name in STAGE_NAMES)
+    stages = ".".join(str(STAGE_OF[name].version) for name in STAGE_NAMES)
     return f"{VERSION} (stages {stages})"
 
 
@@ -276,7 +276,7 @@ def make_describe() -> Callable[[list[str]], tuple[str, list[str]]]:
     name = NAME
 
     def seen(path: str) -> bool:
-        import os
+        import os  # here, as all that this function needs
 
         if "://" not in path:
             return os.path.exists(path)
@@ -290,10 +290,10 @@ def make_describe() -> Callable[[list[str]], tuple[str, list[str]]]:
         return True
 
     def describe(paths: list[str]) -> tuple[str, list[str]]:
-        import importlib.metadata
+        import importlib.metadata  # here, as all that this function needs
 
         try:
-            from stages.distributed import cluster
+            from stages.distributed import cluster  # the worker's own
 
             found = cluster.edition()
         except (ImportError, AttributeError):

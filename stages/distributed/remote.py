@@ -26,6 +26,7 @@ from stages.run.manifest import MANIFEST, Manifest
 from stages.run.pipeline import Listener
 from stages.run.request import REQUEST
 from stages.run.runfile import RUN_FILE
+from stages.train.checkpoint import FILE_NAME
 
 Location: TypeAlias = Path | str  # a path, or a URL
 
@@ -245,8 +246,6 @@ class UploadListener(Listener):
             self._remote.put(self._local, [f"{self._partial}/{REQUEST}"])
 
     def progressed(self, stage: Stage, label: str, done: int, total: int, numbers: Numbers) -> None:
-        from stages.train.checkpoint import FILE_NAME
-
         name = f"{self._partial}/{FILE_NAME}"
         with suppress(OSError, SplatError):  # without a checkpoint, a resumed run repeats more
             saved_ns = (self._local / name).stat().st_mtime_ns

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from stages.base.stage import Report
 from stages.distributed.tasks import ChunkTask, Executor, OpenExecutor, Resources, run_all
 from stages.run.pipeline import Listener, Pipeline
-
-if TYPE_CHECKING:
-    from stages.sfm.worker.chunks import Chunk
+from stages.sfm.worker.chunks import CHUNK_MEMORY_MIB, Chunk
 
 
 def with_chunks(pipeline: Pipeline, open_executor: OpenExecutor) -> Pipeline:
@@ -33,8 +31,6 @@ def _execute(
     executor: Executor, report: Report, chunks: Sequence[Chunk], check: Callable[[], None]
 ) -> None:
     """See `sfm.worker.chunks.ChunkExecutor`."""
-    from stages.sfm.worker.chunks import CHUNK_MEMORY_MIB
-
     if not chunks:
         return
     label = "extracting features" if chunks[0].photographs else "matching"

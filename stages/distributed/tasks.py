@@ -12,7 +12,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 from stages.base.errors import CRASHED, Family, Interrupted, SplatError
 from stages.base.text import reason_of
@@ -20,9 +20,8 @@ from stages.distributed.remote import Location, local_copies
 from stages.run.attempt import Listeners
 from stages.run.failures import as_splat_error
 from stages.run.pipeline import Listener, Pipeline
-
-if TYPE_CHECKING:
-    from stages.sfm.worker.chunks import Chunk
+from stages.sfm.worker.chunks import Chunk, run_chunk
+from stages.train.cap import needed_mib
 
 _log = logging.getLogger(__name__)
 
@@ -84,8 +83,6 @@ class ChunkTask:
         return self.chunk.out.parent
 
     def run(self, listener: Listener | None = None) -> None:
-        from stages.sfm.worker.chunks import run_chunk
-
         run_chunk(self.chunk)
 
 
@@ -108,8 +105,6 @@ class Resources:
 
 def resources_of(train: Any) -> Resources:
     """The most that a run with these training settings needs."""
-    from stages.train.cap import needed_mib
-
     memory_mib = needed_mib(train.max_splats) if train.max_splats else None
     return Resources(memory_mib, gpus=int(train.backend == "gpu" or train.device == "cuda"))
 

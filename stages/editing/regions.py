@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from plyfile import PlyData, PlyParseError
+from scipy.spatial import ConvexHull, QhullError
 
 from stages.base.bad_files import BadFileError, FileKind, reading
 from stages.base.errors import UsageError
@@ -60,8 +62,6 @@ def parse_numbers(text: str, count: int) -> NDArray[np.float64] | None:
 
 
 def _inside_hull(path: Path) -> Inside:
-    from scipy.spatial import ConvexHull, QhullError
-
     with reading(path, _HULL):
         points = _points(path)
         if points.ndim != 2 or points.shape[1] != 3 or len(points) < 4:
@@ -110,7 +110,6 @@ def _inside_lasso(view: NDArray[np.float64], corners: NDArray[np.float64]) -> In
 def _points(path: Path) -> NDArray[np.float64]:
     if path.suffix.lower() == ".json":
         return np.array(json.loads(path.read_text(encoding="utf-8")), np.float64)
-    from plyfile import PlyData, PlyParseError
 
     try:
         vertices = PlyData.read(str(path))["vertex"]

@@ -8,12 +8,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from stages.base import scratch
 from stages.base.blocks import reported_blocks
-from stages.raster.reference import sh_basis
+from stages.raster.sh import sh_basis
 from stages.scene import Camera, Splats
 from stages.scene.recentring import recentred
 from stages.scene.rotations import quaternions_of
@@ -97,8 +97,6 @@ class Similarity:
 
 def rotation_about(axis: NDArray[np.float64], degrees: float) -> NDArray[np.float64]:
     """[3, 3] the rotation about `axis` [3], right-handed."""
-    from scipy.spatial.transform import Rotation
-
     turn = np.deg2rad(degrees) * axis / np.linalg.norm(axis)
     return np.asarray(Rotation.from_rotvec(turn).as_matrix())
 
@@ -128,8 +126,8 @@ def _sh_rotation(rotation: NDArray[np.float64], sh_degree: int) -> NDArray[np.fl
     """
     directions = np.random.default_rng(0).normal(size=(64, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    rotated = sh_basis(torch.from_numpy(directions), sh_degree).numpy()
-    original = sh_basis(torch.from_numpy(directions @ rotation), sh_degree).numpy()
+    rotated = sh_basis(directions, sh_degree)
+    original = sh_basis(directions @ rotation, sh_degree)
     matrix = np.zeros((rotated.shape[1], rotated.shape[1]))
     for degree in range(sh_degree + 1):
         own = slice(degree * degree, (degree + 1) ** 2)

@@ -10,7 +10,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from stages.evaluate.evaluation import EvaluationView, image_renderer
@@ -28,7 +27,7 @@ from stages.raster.definition import (
     splat_arrays,
 )
 from stages.raster.draw import raster_settings_of
-from stages.raster.reference import sh_basis
+from stages.raster.sh import sh_basis
 from stages.scene import IGNORE, Camera, Splats
 
 VISIBLE_WEIGHT = 1.0 / 255.0  # a smaller blend weight cannot change an 8-bit picture
@@ -247,7 +246,7 @@ def colours_by_degree(splats: Splats, centre: NDArray[np.floating]) -> NDArray[n
     offsets = splats.means - centre
     with np.errstate(invalid="ignore", divide="ignore"):
         directions = offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
-    basis = sh_basis(torch.from_numpy(directions), splats.sh_degree).numpy()
+    basis = sh_basis(directions, splats.sh_degree)
     terms = basis[:, :, None] * splats.sh
     ends = np.arange(1, splats.sh_degree + 2) ** 2 - 1
     return np.maximum(0.5 + np.cumsum(terms, axis=1)[:, ends], 0.0)

@@ -12,6 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from stages.evaluate.contribution import blend_weights
 from stages.raster.draw import render
@@ -337,10 +340,6 @@ def poorly_covered_regions(
 
 def _connected(centres: NDArray[np.float64], side: float) -> list[NDArray[np.intp]]:
     """Groups of rows whose cubes touch."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
-
     if not len(centres):
         return []
     pairs = cKDTree(np.floor(centres / side)).query_pairs(1.01, output_type="ndarray")

@@ -22,6 +22,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from stages.base.blocks import reported_blocks
 from stages.evaluate.contribution import VISIBLE_WEIGHT, Contributions, near_view_frusta
@@ -72,8 +73,6 @@ def isolated_splats(splats: Splats) -> NDArray[np.bool_]:
     In a sparse background every distance is large, so no splat there is isolated. Means must be
     finite.
     """
-    from scipy.spatial import KDTree
-
     count = min(_NEIGHBOURS, len(splats) - 1)
     if count < 2:
         return np.zeros(len(splats), bool)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -41,8 +42,6 @@ def psnr_text(psnr_db: float, digits: int = 2) -> str:
 def ssim(image: NDArray[np.floating], truth: NDArray[np.floating], valid: Valid = None) -> float:
     """Mean structural similarity (Wang et al. 2004): Gaussian window 11x11, sigma 1.5, zero
     padded, K1 = 0.01, K2 = 0.03; in float64. Pixels that do not count are taken to be equal."""
-    import cv2
-
     image = _equal_outside(image, truth, valid)
     a = np.asarray(image, np.float64)
     b = np.asarray(truth, np.float64)

@@ -9,68 +9,35 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from stages import formats
 from stages.base.bad_files import reading, stage_output
 from stages.base.errors import Interrupted, QualityError, SplatError
-from stages.base.settings import setting
-from stages.base.stage import Report, Stage
+from stages.base.stage import Report
 from stages.base.text import counted
+from stages.export.settings import ExportSettings
+from stages.formats import Format, format_of
+from stages.formats.losses import losses_of
+from stages.formats.mesh_files import fault_of
 from stages.formats.output_formats import (
-    DEFAULT_FORMATS,
-    drawing_setting,
-    formats_setting,
     mesh_formats,
 )
+from stages.formats.sog_quantisation import splats_to_write
 from stages.formats.table import FORMATS
+from stages.formats.values import drop_undrawable
+from stages.mesh.collision_mesh import make_collision_mesh
+from stages.proof.prover import Prover, cameras_for, provers_of
 from stages.raster.backends import (
     backend_of_settings,
-    backend_setting,
-    device_setting,
     report_backend,
 )
-
-if TYPE_CHECKING:
-    from stages.formats import Format
-    from stages.proof.prover import Prover
-    from stages.scene import (
-        ExportedAssets,
-        ExportedFile,
-        QuantisedSplats,
-        Reconstruction,
-        Splats,
-    )
+from stages.scene import ExportedAssets, ExportedFile, QuantisedSplats, Reconstruction, Splats
 
 _INDEX = "assets.json"
-# Every system must take the name, USD's packages too: brackets separate names inside them.
-_NAME = r"(?!assets$)(?![ .])[^/\\:*?\"<>|\[\]\x00-\x1f]{1,100}(?<![ .])"
-
-
-@dataclass(frozen=True)
-class ExportSettings:
-    """Settings of the export."""
-
-    formats: tuple[str, ...] = formats_setting(
-        DEFAULT_FORMATS,
-        "File format to write; repeatable. mesh is a collision proxy, as .glb and .ply",
-        panel="Output",
-    )
-    name: str = setting(
-        "scene",
-        "Name of the files, without a suffix.",
-        pattern=_NAME,
-        wanted="A name that every system takes: letters, digits, spaces, - and _; no "
-        "folder, no suffix.",
-    )
-    backend: str = backend_setting()
-    device: str = device_setting()
-    drawing: str = drawing_setting()
-    mesh_triangles: int = setting(
-        50_000, "Triangles of the mesh, at most about.", min=100, max=100_000_000
-    )
 
 
 def run(
@@ -84,12 +51,6 @@ def run(
     `CollisionMesh`. Raises SplatError "export-verify-failed" (family QUALITY), and what keeps a
     file from being written.
     """
-    from stages import formats
-    from stages.formats.sog_quantisation import splats_to_write
-    from stages.formats.values import drop_undrawable
-    from stages.proof.prover import cameras_for, provers_of
-    from stages.scene import ExportedAssets, ExportedFile
-
     quantised: QuantisedSplats = replace(inputs["quantise"], drawing=settings.drawing)
     reconstruction: Reconstruction = inputs["sfm"]
     place = reconstruction.place
@@ -140,9 +101,6 @@ def _write_meshes(
     rows = mesh_formats(settings.formats)
     if not rows:
         return []
-    from stages.formats.mesh_files import fault_of
-    from stages.mesh.collision_mesh import make_collision_mesh
-    from stages.scene import ExportedFile
 
     made = make_collision_mesh(
         splats, reconstruction, settings.mesh_triangles, backend_of_settings(settings), report
@@ -172,8 +130,6 @@ def _warn_of_missing(count: int, dropped: int, report: Report) -> None:
 
 
 def _warn_of_losses(row: Format, path: Path, splats: Splats, report: Report) -> None:
-    from stages.formats.losses import losses_of
-
     for code, text in losses_of(row, path.name, splats).items():
         report.warn(f"export-{row.ending.replace('.', '-')}-{code}", text)
 
@@ -185,8 +141,6 @@ def _write_index(folder: Path, files: list[ExportedFile]) -> None:
 
 def _prove(prover: Prover, path: Path, report: Report) -> dict[str, Any]:
     """The file's figures. Raises SplatError "export-verify-failed"."""
-    from stages.formats import format_of
-
     row, proof = format_of(path), prover.prove(path)
     if proof.fault:
         raise _failed(path, proof.fault, "splats")
@@ -210,21 +164,9 @@ def _failed(path: Path, reason: str, held: str) -> SplatError:
 
 def load(folder: Path) -> ExportedAssets:
     """The files of a finished folder. Raises SplatError if its index is damaged."""
-    from stages.scene import ExportedAssets, ExportedFile
-
     with reading(folder / _INDEX, stage_output("export-folder-damaged")):
         entries = json.loads((folder / _INDEX).read_text(encoding="utf-8"))
         files = tuple(
             ExportedFile(str(e["format"]), str(e["path"]), int(e["size_bytes"])) for e in entries
         )
     return ExportedAssets(folder, files)
-
-
-STAGE = Stage(
-    name="export",
-    version=12,
-    reads=("sfm", "quantise"),
-    settings_type=ExportSettings,
-    run=run,
-    load=load,
-)

@@ -69,18 +69,17 @@ def write(
     Returns how many splats could not be drawn (values not finite, or too large) and were left out.
     Raises SplatError as `format_of`, or what keeps the file from being written.
     """
-    from stages.formats.offset import write_offset
-    from stages.formats.values import drop_undrawable
+    from stages.formats import offset, values  # they load NumPy, which the table does without
 
     row = format_of(path)
     remove_abandoned_files(Path(path).parent)
     more: dict[str, Any] = {"views": views} if row.takes_views else {}
     if row.streamed:
         more["coarser"] = coarser
-    splats, dropped = drop_undrawable(splats)
+    splats, dropped = values.drop_undrawable(splats)
     resolve_name(row.writer)(Path(path), splats, units=units, **more)
     if not row.holds_origin:
-        write_offset(Path(path), row, splats, units)
+        offset.write_offset(Path(path), row, splats, units)
     return dropped
 
 
@@ -90,24 +89,23 @@ def read(path: Path, *, strict: bool = True) -> Splats:
     strict: whether a value that is not finite makes the file unreadable. Raises SplatError as
     `format_of`, or "splats-unreadable".
     """
-    from stages.formats.offset import offset_path, read_offset
-    from stages.formats.values import check_finite, nonfinite_allowed
+    from stages.formats import offset, values  # they load NumPy, which the table does without
 
     path, row = Path(path), format_of(path)
-    with nullcontext() if strict else nonfinite_allowed(), reading(path):
-        splats: Splats = check_finite(resolve_name(row.reader)(path))
-    if row.holds_origin or not offset_path(path).exists():
+    with nullcontext() if strict else values.nonfinite_allowed(), reading(path):
+        splats: Splats = values.check_finite(resolve_name(row.reader)(path))
+    if row.holds_origin or not offset.offset_path(path).exists():
         return splats
-    with reading(offset_path(path)):
-        return read_offset(path, row, splats)
+    with reading(offset.offset_path(path)):
+        return offset.read_offset(path, row, splats)
 
 
 def read_drawable(path: Path) -> tuple[Splats, int]:
     """(the splats of the file that can be drawn, the number of others). Raises SplatError as
     `read`; a file with more splats that are not finite than others is unreadable."""
-    from stages.formats.values import drop_undrawable
+    from stages.formats import values  # it loads NumPy, which the table does without
 
-    splats, others = drop_undrawable(read(path, strict=False))
+    splats, others = values.drop_undrawable(read(path, strict=False))
     if others > len(splats):
         read(path)
     return splats, others
@@ -116,14 +114,14 @@ def read_drawable(path: Path) -> tuple[Splats, int]:
 def units_of(path: Path) -> str:
     """ "metres" where the file, or the one beside it that holds its origin, declares them as ours
     do; else "arbitrary". Raises SplatError as `format_of`, or "splats-unreadable"."""
-    from stages.formats.offset import offset_path, read_units
+    from stages.formats import offset  # it loads NumPy, which the table does without
 
     path, row = Path(path), format_of(path)
     if not row.holds_origin:
-        if not offset_path(path).exists():
+        if not offset.offset_path(path).exists():
             return "arbitrary"
-        with reading(offset_path(path)):
-            declared = read_units(path)
+        with reading(offset.offset_path(path)):
+            declared = offset.read_units(path)
     elif row.units:
         with reading(path):
             declared = resolve_name(row.units)(path)

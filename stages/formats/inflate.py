@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, BinaryIO
 
 import numpy as np
+import zstandard
 from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError
@@ -50,8 +51,6 @@ def read_zstd_frame(file: BinaryIO, packed_bytes: int, count: int) -> NDArray[np
     `packed_bytes` must be at most the size of the file, and `count` must have passed `check_size`,
     because that much memory is allocated. Raises BadFileError for a damaged frame.
     """
-    import zstandard
-
     packed = file.read(packed_bytes)
     if len(packed) < packed_bytes:
         raise BadFileError("it is cut short")

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from plyfile import PlyData
+from pygltflib import GLTF2
 
 from stages.base.atomic import replacing
 from stages.formats.gltf_file import Attribute, asset, buffer_fields, write_glb
@@ -65,8 +67,6 @@ def _ply_header(mesh: Mesh, units: str) -> bytes:
 
 def read_ply(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
     """(vertices [V, 3], faces [F, 3]) by plyfile, in the world's axes."""
-    from plyfile import PlyData
-
     data = PlyData.read(str(path))
     vertices = np.stack([data["vertex"][axis] for axis in "xyz"], axis=1)
     faces = list(data["face"]["vertex_indices"])
@@ -134,8 +134,6 @@ def _described(attributes: dict[str, Attribute], indices: Attribute) -> dict[str
 
 def read_glb(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
     """(vertices [V, 3], faces [F, 3]) by pygltflib, rotated from y up to the world's axes."""
-    from pygltflib import GLTF2
-
     document = GLTF2().load(str(path))
     assert document is not None
     if not document.meshes:

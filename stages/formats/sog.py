@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from stages.base import scratch
 from stages.base.atomic import replacing
@@ -88,8 +89,6 @@ def _add(package: zipfile.ZipFile, name: str, content: bytes) -> None:
 
 
 def _webp(pixels: NDArray[np.uint8]) -> bytes:
-    from PIL import Image
-
     file = io.BytesIO()
     # exact: keep colours where alpha is 0
     Image.fromarray(pixels).save(file, "WEBP", lossless=True, exact=True, method=4)

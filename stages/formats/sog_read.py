@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from stages.base.bad_files import BadFileError
 from stages.base.blocks import reported_blocks
@@ -162,8 +163,6 @@ class Source:
         self, meta: dict[str, Any], part: str, number: int, count: int, width: int = 0
     ) -> NDArray[np.uint8]:
         """[count, 4] the first pixels of an image in row-major order."""
-        from PIL import Image
-
         files = _part(meta, part).get("files")
         if not isinstance(files, list) or len(files) <= number:
             raise BadFileError(f"its meta.json names no picture {number} of {part}")

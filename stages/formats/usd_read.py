@@ -191,7 +191,7 @@ def _placement(prim: Any) -> tuple[float, NDArray[np.float64]]:
 
 def _limit_memory(path: Path) -> None:
     with suppress(ImportError, ValueError, OSError):  # on Linux only; or limited already
-        import resource
+        import resource  # not on Windows
 
         from pxr import Sdf, Usd, UsdGeom  # noqa: F401 - loaded before it is measured
 

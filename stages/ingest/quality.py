@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from stages.ingest.colour import luminance
 from stages.scene import fitted_size
@@ -91,9 +93,6 @@ def _thumbnail(grey: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 def near_duplicates(thumbnails: list[NDArray[np.float32]]) -> list[tuple[int, ...]]:
     """Groups of indices of photographs that show nearly the same, each group in order."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     stack = np.stack([thumbnail.ravel() for thumbnail in thumbnails])
     pairs = [
         (first, first + 1 + int(second))

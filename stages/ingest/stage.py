@@ -10,77 +10,28 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from stages.base import threads
 from stages.base.errors import Interrupted
-from stages.base.settings import setting
-from stages.base.stage import Report, Stage
-
-if TYPE_CHECKING:
-    from stages.ingest.decode import Decoded, PixelBudget, Unusable
-    from stages.ingest.masking import MaskedPhoto
-    from stages.ingest.quality import Measures
-    from stages.ingest.sources import DepthFile, Findings, Source
-    from stages.scene import Capture, Photo
+from stages.base.stage import Report
+from stages.ingest import advice, capture_file, depth_files, faces, masking, video_frames
+from stages.ingest.capture_file import load_capture
+from stages.ingest.decode import Decoded, PixelBudget, Unusable, decode, readers_set_up
+from stages.ingest.depth_files import FOLDERS, read_depth
+from stages.ingest.faces import face_photos
+from stages.ingest.find import find
+from stages.ingest.masking import AUTO, MaskedPhoto, cuts_out_object
+from stages.ingest.masks import check_pairing, check_rig_mask, mask_folder
+from stages.ingest.panorama import SPHERE, hint_for, panorama
+from stages.ingest.quality import Measures, measure, near_duplicates
+from stages.ingest.settings import IngestSettings
+from stages.ingest.sources import DepthFile, Findings, Source
+from stages.ingest.write import write_depth, write_photo
+from stages.scene import TRANSPARENT, Capture, Photo
 
 FEWEST_PHOTOGRAPHS = 3
 _PIXELS_AT_ONCE = 250_000_000  # over all threads; about 4 bytes each while they are decoded
-
-
-@dataclass(frozen=True)
-class IngestSettings:
-    """Settings of reading photographs."""
-
-    max_side: int = setting(
-        1600,
-        "Longer side of the photographs used for structure from motion and, at most, "
-        "for training (px).",
-        panel="Quality and time",
-        min=64,
-        max=32_768,
-    )
-    masks: Path | None = setting(
-        None,
-        "Folder of masks, white where a photograph counts, named as the photographs "
-        "are: a.png, a.jpg.png or a_mask.png for a.jpg. A folder called masks in or beside "
-        "that of the photographs is found without this option.",
-        panel="Light and masks",
-        affects_output=False,  # its content does, which is an input
-    )
-    invert_masks: bool = setting(
-        False, "Masks are black where a photograph counts, not white.", panel="Light and masks"
-    )
-    mask_means: str = setting(
-        "auto",
-        "How pixels outside a mask are treated: ignore (as unknown), transparent (as "
-        "empty space) or auto (transparent for transparent pictures and for mask files that cut "
-        "out an object, ignore for other mask files).",
-        panel="Light and masks",
-        choices=("auto", "ignore", "transparent"),
-    )
-    rig_mask: Path | None = setting(
-        None,
-        "Picture twice as wide as high, black where every 360-degree picture shows the camera's "
-        "stand, the person who holds it, or a bad seam.",
-        panel="Light and masks",
-        affects_output=False,  # its content does, which is an input
-    )
-    depth: Path | None = setting(
-        None,
-        "Folder of measured depth maps, named as the photographs are, or a transforms.json that "
-        "names them. A folder called depth in or beside that of the photographs is found without "
-        "this option.",
-        panel="Input",
-        affects_output=False,  # its content does, which is an input
-    )
-    frames: int = setting(
-        0,
-        "Frames to take from each video, at most; 0 chooses by how far the camera moves.",
-        panel="Input",
-        min=0,
-        max=100_000,
-    )
 
 
 @dataclass(frozen=True)
@@ -118,12 +69,6 @@ def run(
         SplatError: there are fewer than 3 usable photographs, or masks or --depth do not fit them.
         Interrupted: the user stopped it.
     """
-    from stages.ingest import advice, capture_file, depth_files, masking
-    from stages.ingest.find import find
-    from stages.ingest.masks import check_pairing, check_rig_mask, mask_folder
-    from stages.ingest.quality import near_duplicates
-    from stages.scene import TRANSPARENT, Capture
-
     root = Path(inputs["photos"])
     check_rig_mask(settings.rig_mask)
     apart = mask_folder(root, settings.masks)
@@ -171,8 +116,6 @@ def run(
 
 def load(folder: Path) -> Capture:
     """The capture of a finished folder; pictures are not opened."""
-    from stages.ingest.capture_file import load_capture
-
     return load_capture(folder)
 
 
@@ -181,8 +124,6 @@ def _masks_cut_out(found: Findings, settings: IngestSettings) -> bool:
 
     All photographs must have masks: of the others everything would be seen.
     """
-    from stages.ingest.masking import AUTO, cuts_out_object
-
     masks = [found.masks[one.name] for one in found.sources if one.name in found.masks]
     decided = settings.mask_means != AUTO or bool(found.videos)
     return (
@@ -196,8 +137,6 @@ def _ingest_photographs(
     found: Findings, settings: IngestSettings, folder: Path, report: Report
 ) -> list[_Ingested]:
     """All photographs, in order; a few are read at once."""
-    from stages.ingest.decode import PixelBudget, readers_set_up
-
     budget = PixelBudget(_PIXELS_AT_ONCE)
     ingested: list[_Ingested] = []
     total = len(found.sources)
@@ -221,10 +160,6 @@ def _ingest_photographs(
 def _ingest_photograph(
     source: Source, found: Findings, settings: IngestSettings, folder: Path, budget: PixelBudget
 ) -> _Ingested:
-    from stages.ingest import faces
-    from stages.ingest.decode import Unusable, decode
-    from stages.ingest.panorama import SPHERE, hint_for, panorama
-
     try:
         decoded = decode(source.path, settings.max_side, budget)
         kind = panorama(decoded.pixels, decoded.stored, decoded.exif.projection)
@@ -242,10 +177,6 @@ def _ingest_photograph(
 
 def _with_depth(done: _Ingested, file: DepthFile, decoded: Decoded, folder: Path) -> _Ingested:
     """The photograph with its depth map, which is written, or with why that cannot be used."""
-    from stages.ingest.decode import Unusable
-    from stages.ingest.depth_files import FOLDERS, read_depth
-    from stages.ingest.write import write_depth
-
     photo = done.photos[0]
     place = f"{FOLDERS[0]}/{photo.picture}.npy"
     try:
@@ -261,9 +192,6 @@ def _ingest_video(
     source: Source, settings: IngestSettings, folder: Path, report: Report
 ) -> list[_Ingested]:
     """The chosen frames of a video, as photographs of one camera."""
-    from stages.ingest import video_frames
-    from stages.ingest.decode import Unusable
-
     try:
         kind, chosen = video_frames.photographs(source, settings.frames, settings.max_side, report)
         return [
@@ -305,14 +233,6 @@ def _write(
         video: that it is a frame of.
         kind: `panorama.SPHERE` or "".
     """
-    from stages.ingest.decode import Unusable
-    from stages.ingest.faces import face_photos
-    from stages.ingest.masking import MaskedPhoto
-    from stages.ingest.panorama import SPHERE
-    from stages.ingest.quality import measure
-    from stages.ingest.write import write_photo
-    from stages.scene import TRANSPARENT
-
     masked = MaskedPhoto.of(decoded, name, mask, settings.invert_masks, settings.mask_means)
     if kind == SPHERE and settings.rig_mask is not None:
         masked = masked.without(settings.rig_mask, name)
@@ -336,8 +256,6 @@ def _write(
 
 def _photo(name: str, image: str, masked: MaskedPhoto, measures: Measures, video: str) -> Photo:
     """What is known of a picture. Arguments as of `_write`."""
-    from stages.scene import Photo
-
     decoded, exif = masked.decoded, masked.decoded.exif
     height, width = decoded.pixels.shape[:2]
     focal = exif.focal_px(decoded.stored, width, height)
@@ -373,8 +291,6 @@ def _report_capture(
     photos: tuple[Photo, ...], duplicates: list[tuple[int, ...]], report: Report
 ) -> None:
 
-    from stages.ingest import advice
-
     blurred = advice.about_capture(photos, duplicates, report.warn)
     report.metric("photographs", len(photos))
     report.metric("panoramas", sum(photo.face is not None for photo in photos))
@@ -385,6 +301,3 @@ def _report_capture(
     report.metric("cameras", len({photo.camera for photo in photos}))
     report.metric("blurred", len(blurred))
     report.metric("near_duplicates", sum(len(group) - 1 for group in duplicates))
-
-
-STAGE = Stage(name="ingest", version=14, reads=(), settings_type=IngestSettings, run=run, load=load)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from stages.base.errors import Interrupted
 from stages.base.stage import Report
@@ -144,8 +145,6 @@ def colour_vertices(mesh: Mesh, maps: list[DepthMap], tolerance: float) -> Mesh:
     tolerance: the largest distance in depth between a pixel and a vertex that it sees, world units.
     A vertex that no pixel sees takes the colour of the nearest one that is seen.
     """
-    from scipy.spatial import cKDTree
-
     if not len(mesh.vertices):
         return mesh
     sums, weights = np.zeros((len(mesh.vertices), 3)), np.zeros(len(mesh.vertices))

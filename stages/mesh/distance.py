@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from stages.scene.mesh import Mesh
 
@@ -21,8 +22,6 @@ def distances_to_mesh(
     `spacing` apart. It is never too small, and too large only where all eight samples miss the
     nearest triangle.
     """
-    from scipy.spatial import cKDTree
-
     if not len(mesh.faces):
         return np.full(len(points), np.inf)
     corners = mesh.vertices[mesh.faces].astype(np.float64)

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import itertools
 
+import fast_simplification
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from stages.mesh.fuse import Volume
 from stages.scene.mesh import Mesh
@@ -46,9 +49,6 @@ def _observed_cubes(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def remove_small_components(mesh: Mesh) -> tuple[Mesh, int]:
     """(the mesh, number of removed components): those of less than SMALL_COMPONENT of the
     area."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     count = len(mesh.vertices)
     if not count:
         return mesh, 0
@@ -70,12 +70,10 @@ def face_areas(mesh: Mesh) -> NDArray[np.float64]:
 def simplify(mesh: Mesh, triangles: int) -> Mesh:
     """The mesh with at most about `triangles` triangles, by quadric error metrics (Garland &
     Heckbert, SIGGRAPH 1997)."""
-    from fast_simplification import simplify
-
     if len(mesh.faces) <= triangles:
         return mesh
     # Normalised, because the library has absolute thresholds.
     low, size = mesh.vertices.min(axis=0), float(np.ptp(mesh.vertices, axis=0).max())
     unit = (mesh.vertices.astype(np.float64) - low) / size
-    vertices, faces = simplify(unit, mesh.faces, target_count=triangles)
+    vertices, faces = fast_simplification.simplify(unit, mesh.faces, target_count=triangles)
     return Mesh.of(vertices * size + low, faces)

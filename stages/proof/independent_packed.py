@@ -15,6 +15,8 @@ from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
+from plyfile import PlyData
 
 from stages.formats.values import concatenate
 from stages.proof.content import NotCrossCheckedError, logits, says_antialiased, splats_by_rows
@@ -22,8 +24,6 @@ from stages.scene import Splats
 
 
 def compressed_ply(path: Path) -> Splats:
-    from plyfile import PlyData
-
     data = PlyData.read(str(path), mmap="c")
     ranges, rest = data["chunk"], data["sh"].data if "sh" in data else np.zeros(0, "u1")
     names = rest.dtype.names or ()
@@ -143,8 +143,6 @@ def streamed_sog(path: Path) -> Splats:
 
 
 def sog(path: Path | BinaryIO) -> Splats:
-    from PIL import Image
-
     with zipfile.ZipFile(path) as package:
         meta = json.loads(package.read("meta.json"))
 

@@ -18,9 +18,12 @@ from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any, BinaryIO
+from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
+from plyfile import PlyData
+from pygltflib import GLTF2
 
 from stages.base.blocks import release_mapped_pages
 from stages.base.usd_path import accepted_path
@@ -41,8 +44,6 @@ _PAGE_PIECE = 1 << 22  # characters: the parser scans an unfinished element once
 
 
 def ply(path: Path) -> Splats:
-    from plyfile import PlyData
-
     content = PlyData.read(str(path), mmap="c")
     if "chunk" in content:
         return compressed_ply(path)
@@ -140,8 +141,6 @@ def _in_file(path: Path, begins: int = 0) -> _Buffer:
 
 
 def _gltf_buffer(folder: Path, uri: str) -> _Buffer:
-    from urllib.parse import unquote
-
     if not uri.startswith("data:"):
         return _in_file(folder / unquote(uri))
     content = base64.b64decode(uri.partition(",")[2], validate=True)
@@ -150,8 +149,6 @@ def _gltf_buffer(folder: Path, uri: str) -> _Buffer:
 
 def _gltf_parts(path: Path) -> tuple[Any, list[_Buffer]]:
     """(the document, its buffers)."""
-    from pygltflib import GLTF2
-
     if path.suffix.lower() == ".gltf":
         document = GLTF2.gltf_from_json(path.read_text(encoding="utf-8"))
         return document, [_gltf_buffer(path.parent, buffer.uri) for buffer in document.buffers]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -110,8 +111,6 @@ def _match_neighbours(
     several proposals for one row the most similar wins. In the first round a row that has `moved`
     may also propose to its own, at the cost of one allowed difference instead of its distance.
     """
-    import cv2
-
     mine, theirs = mismatched, index[mismatched]
     for _ in range(_ROUNDS):
         # in a tree of coinciding points, every search would visit all of them

@@ -9,80 +9,39 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from stages.base.settings import setting
-from stages.base.stage import Report, Stage
+import numpy as np
+
+from stages.base.stage import Report
+from stages.evaluate.evaluation import (
+    EvaluationView,
+    load_evaluation_views,
+    mean_psnr_db,
+    psnr_of_views_db,
+)
+from stages.formats.sog_bits import choose_bits, file_size_bytes
 from stages.formats.table import FORMATS
-from stages.prune.shared import DECIDING_VIEWS, SOG_LOSS_DB
+from stages.prune.rounds import Pruner, PruningResult
+from stages.prune.settings import DECIDING_VIEWS, SOG_LOSS_DB, PruneSettings
+from stages.prune.summary import advise_more_splats, describe_loss, summarise
+from stages.prune.targets import Targets
 from stages.raster.backends import (
     backend_of_settings,
-    backend_setting,
-    device_setting,
     report_backend,
 )
-
-if TYPE_CHECKING:
-    from stages.evaluate.evaluation import EvaluationView
-    from stages.prune.rounds import Pruner, PruningResult
-    from stages.scene import Reconstruction, Splats, TrainedSplats
-
-
-@dataclass(frozen=True)
-class PruneSettings:
-    """Settings of pruning."""
-
-    rounds: int = setting(
-        8, "Rounds of pruning, each of a tenth of the splats at most; 0 for none.", min=0, max=100
-    )
-    strength: float = setting(
-        1.0,
-        "Pruning strength: larger removes more, and allows more loss.",
-        panel="Size",
-        min=0.001,
-        max=1000,
-    )
-    max_loss_db: float = setting(
-        0.1,
-        "Mean PSNR that held-out views may lose, at strength 1 (dB); none may lose more than 0.3.",
-        min=0,
-        max=100,
-    )
-    max_splats: int = setting(
-        0, "Splats at most, whatever the loss; 0 for any number.", min=0, max=100_000_000
-    )
-    max_mb: float = setting(
-        0.0,
-        "Size at most, whatever the loss, of the file that --mb-of names; 0 for any (megabytes).",
-        panel="Size",
-        min=0,
-        max=1_000_000,
-    )
-    mb_of: str = setting(
-        "ply", "Format that --max-mb is about", panel="Size", choices=tuple(FORMATS)
-    )
-    min_psnr: float = setting(
-        0.0,
-        "Remove as much as leaves the training views this PSNR, instead of by "
-        "--strength; 0 for none (dB).",
-        panel="Size",
-        min=0,
-        max=99,
-    )
-    finetune_steps: int = setting(
-        90,
-        "Steps of fine-tuning after each round that a target needs; 0 for none.",
-        panel="Advanced",
-        min=0,
-        max=100_000,
-    )
-    seconds: float = setting(
-        0.0, "Time limit in seconds: no round begins after it. 0: no limit.", min=0, max=1e7
-    )
-    backend: str = backend_setting()
-    device: str = device_setting()
+from stages.scene import (
+    Reconstruction,
+    Splats,
+    TrainedSplats,
+    evenly_spaced,
+    split_held_out,
+    training_extent,
+)
+from stages.scene.storage import load_splats, save_splats
+from stages.train.finetune import FineTuner
 
 
 def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report: Report) -> Splats:
@@ -91,13 +50,6 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     The report gets each round, counts, and the PSNR before and after. Raises SplatError for targets
     that cannot be met, and Interrupted.
     """
-    import numpy as np
-
-    from stages.evaluate.evaluation import load_evaluation_views, psnr_of_views_db
-    from stages.prune.summary import advise_more_splats, describe_loss, summarise
-    from stages.scene import split_held_out
-    from stages.scene.storage import save_splats
-
     deadline = time.monotonic() + (settings.seconds or math.inf)
     trained: TrainedSplats = inputs["train"]
     reconstruction: Reconstruction = inputs["sfm"].with_cameras(trained.cameras)
@@ -153,11 +105,6 @@ def pruner_of(
         report: for progress.
         deadline: after which no round begins, as `time.monotonic`.
     """
-    from stages.prune.rounds import Pruner
-    from stages.prune.targets import Targets
-    from stages.scene import training_extent
-    from stages.train.finetune import FineTuner
-
     extent = training_extent(reconstruction)
     finetuner = FineTuner(training, extent, backend, report, trained.dropout)
     targets = Targets(
@@ -180,10 +127,6 @@ def _size_measure(
 ) -> Callable[[Splats], int]:
     """Gives the size of the file that --max-mb is about. A .sog is written with the bit depths that
     `quantise` chooses for all splats: they hardly depend on how many are left."""
-    from stages.evaluate.evaluation import mean_psnr_db
-    from stages.formats.sog_bits import choose_bits, file_size_bytes
-    from stages.scene import evenly_spaced
-
     row = FORMATS[settings.mb_of]
     depths: dict[str, int] = {}
     if settings.max_mb and row.quantiser:
@@ -218,16 +161,4 @@ def _report_result(before: Splats, found: PruningResult, report: Report) -> None
 
 def load(folder: Path) -> Splats:
     """The pruned splats."""
-    from stages.scene.storage import load_splats
-
     return load_splats(folder)
-
-
-STAGE = Stage(
-    name="prune",
-    version=22,
-    reads=("sfm", "train"),
-    settings_type=PruneSettings,
-    run=run,
-    load=load,
-)

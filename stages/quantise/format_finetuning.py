@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +17,7 @@ from stages.formats.sog_quantisation import BitDepths, quantise_splats, splats_t
 from stages.formats.table import FORMATS, Format
 from stages.formats.values import drop_undrawable
 from stages.quantise.rounding import finetune_to_rounding, write_and_read
+from stages.quantise.settings import QuantiseSettings
 from stages.raster.backends import backend_of_settings
 from stages.raster.compensation import without_compensation
 from stages.scene import (
@@ -28,9 +28,6 @@ from stages.scene import (
     training_extent,
 )
 from stages.train.finetune import FineTuner
-
-if TYPE_CHECKING:
-    from stages.quantise.stage import QuantiseSettings
 
 
 @dataclass(frozen=True)

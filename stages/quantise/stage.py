@@ -12,37 +12,48 @@ without it.
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.base.atomic import replacing
 from stages.base.bad_files import reading, stage_output
 from stages.base.errors import RunFolderError
-from stages.base.settings import setting
-from stages.base.stage import Report, Stage
-from stages.formats.output_formats import (
-    CHOICES,
-    DEFAULT_FORMATS,
-    drawing_setting,
-    formats_setting,
-    formats_to_finetune,
+from stages.base.stage import Report
+from stages.evaluate.evaluation import (
+    SIZES,
+    EvaluationView,
+    load_evaluation_views,
+    mean_psnr_db,
+    psnr_name,
 )
-from stages.formats.table import AUTO, FORMATS, PLAIN
-from stages.prune.shared import DECIDING_VIEWS, SOG_LOSS_DB
+from stages.evaluate.sh import sufficient_degrees, truncate_sh, view_averaged_dc
+from stages.formats.sog_bits import choose_bits
+from stages.formats.sog_quantisation import splats_to_write
+from stages.formats.table import FORMATS, PLAIN
+from stages.quantise.format_finetuning import FormatFinetuning
+from stages.quantise.rounding import write_and_read
+from stages.quantise.settings import QuantiseSettings
 from stages.raster.backends import (
     backend_of_settings,
-    backend_setting,
-    device_setting,
     report_backend,
 )
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from stages.evaluate.evaluation import EvaluationView
-    from stages.scene import DrawSettings, QuantisedSplats, Reconstruction, Splats, TrainedSplats
+from stages.scene import (
+    DrawSettings,
+    QuantisedSplats,
+    Reconstruction,
+    Splats,
+    TrainedSplats,
+    evenly_spaced,
+    load_splats,
+    save_splats,
+    split_held_out,
+)
 
 _DECISIONS, _FLAT, _FINETUNED = "decisions.json", "flat_dc.npy", "finetuned"
 _SOG = "sog"  # the format whose bits are chosen
@@ -50,53 +61,6 @@ _SOG = "sog"  # the format whose bits are chosen
 # first.
 _THRESHOLDS_OF_255 = (8.0, 4.0, 2.0, 1.0, 0.5, 0.25)
 _BIT_DEPTH_MEASUREMENTS = 25  # about, for the progress bar
-
-
-@dataclass(frozen=True)
-class QuantiseSettings:
-    """Settings of the choice of precision. Of the formats, only those that need fine-tuning are
-    kept: a further lossless format changes nothing here."""
-
-    max_loss_db: float = setting(
-        0.02, "PSNR of training views that lower SH degrees may cost (dB).", min=0, max=100
-    )
-    sog_loss_db: float = setting(
-        SOG_LOSS_DB,
-        "PSNR of training views that fewer bits in a .sog may cost besides, before "
-        "fine-tuning recovers a part of it (dB).",
-        min=0,
-        max=100,
-    )
-    max_views: int = setting(
-        DECIDING_VIEWS, "Training views to measure on, at most.", min=1, max=100_000
-    )
-    formats: tuple[str, ...] = formats_setting(
-        formats_to_finetune(DEFAULT_FORMATS, AUTO),
-        "File format to fine-tune the splats to; repeatable. Formats that need no fine-tuning "
-        "change nothing",
-        may_be_empty=True,
-    )
-    drawing: str = drawing_setting()
-    plain_steps: int = setting(
-        300,
-        "Steps of fine-tuning of antialiased splats for formats that are drawn plainly.",
-        min=0,
-        max=100_000,
-    )
-    rounding_steps: int = setting(
-        45,
-        "Steps of fine-tuning after each attribute that a format rounds (.splat, .spz, "
-        ".sog, .compressed.ply); 0 for none.",
-        min=0,
-        max=100_000,
-    )
-    backend: str = backend_setting()
-    device: str = device_setting()
-
-    def __post_init__(self) -> None:
-        unknown = tuple(name for name in self.formats if name not in CHOICES)  # refused by checks
-        known = formats_to_finetune(self.formats, self.drawing)
-        object.__setattr__(self, "formats", (*known, *unknown))
 
 
 def run(
@@ -110,12 +74,6 @@ def run(
     finetuned_db (see `quantise.format_finetuning`). Raises SplatError if a photograph cannot be
     read, and Interrupted.
     """
-    from stages.formats.sog_bits import choose_bits
-    from stages.formats.sog_quantisation import splats_to_write
-    from stages.quantise.format_finetuning import FormatFinetuning
-    from stages.quantise.rounding import write_and_read
-    from stages.scene import QuantisedSplats
-
     splats: Splats = inputs["prune"]
     trained: TrainedSplats = inputs["train"]
     reconstruction = inputs["sfm"].with_cameras(trained.cameras)
@@ -171,10 +129,6 @@ def _choose_sh_degrees(
 ) -> tuple[Splats, dict[int, float], float]:
     """(splats without the SH coefficients that training views do not show; PSNR by the SH degree
     of all; the threshold at which single splats have lost degrees, of 255)."""
-    import numpy as np
-
-    from stages.evaluate.sh import sufficient_degrees, truncate_sh
-
     raw_db = decider.psnr(splats)
     by_degree, kept = {splats.sh_degree: raw_db}, splats
     for lower in range(splats.sh_degree):
@@ -197,9 +151,6 @@ def _flat_colours(
     splats: Splats, reconstruction: Reconstruction, settings: QuantiseSettings
 ) -> NDArray[np.float32] | None:
     """[N, 3] DC coefficients for formats without view dependence; None where `splats` have none."""
-    from stages.evaluate.sh import view_averaged_dc
-    from stages.scene import split_held_out
-
     if not splats.sh_degree:
         return None
     views = split_held_out(reconstruction.views)[0]
@@ -221,9 +172,6 @@ def _measures(
     report: Report,
 ) -> tuple[_Measure, _Measure]:
     """(what decides: training views; what evaluates: held-out views if there are any)."""
-    from stages.evaluate.evaluation import load_evaluation_views
-    from stages.scene import evenly_spaced, split_held_out
-
     training, held_out = split_held_out(reconstruction.views)
     if not training:
         raise RunFolderError(
@@ -259,8 +207,6 @@ class _Measure:
 
     def psnr(self, splats: Splats, scale: float = 1.0) -> float:
         """Mean PSNR over the views at `scale` times their size (dB)."""
-        from stages.evaluate.evaluation import mean_psnr_db
-
         mean = round(mean_psnr_db(splats, self.views, self.backend, scale), 4)
         self.done += 1
         total = max(self.planned, self.done)
@@ -269,19 +215,10 @@ class _Measure:
 
     def psnr_at_sizes(self, splats: Splats, stem: str) -> dict[str, float]:
         """Mean PSNR at each of `SIZES`, by the name of the metric."""
-        from stages.evaluate.evaluation import SIZES, psnr_name
-
         return {psnr_name(size, stem): self.psnr(splats, scale) for size, scale in SIZES.items()}
 
 
 def _save(folder: Path, quantised: QuantisedSplats) -> None:
-    import shutil
-
-    import numpy as np
-
-    from stages.base.atomic import replacing
-    from stages.scene import save_splats
-
     shutil.rmtree(folder / _FINETUNED, ignore_errors=True)  # of an interrupted run
     save_splats(folder, quantised.splats)
     decisions = json.dumps(quantised.decisions, indent=1) + "\n"
@@ -297,10 +234,6 @@ def _save(folder: Path, quantised: QuantisedSplats) -> None:
 
 def load(folder: Path) -> QuantisedSplats:
     """The decision in a finished folder. Raises SplatError if it is damaged."""
-    import numpy as np
-
-    from stages.scene import QuantisedSplats, load_splats
-
     splats = load_splats(folder)
     finetuned = {
         path.name: load_splats(path)
@@ -318,13 +251,3 @@ def load(folder: Path) -> QuantisedSplats:
             finetuned=finetuned,
             drawing=decisions["drawing"],
         )
-
-
-STAGE = Stage(
-    name="quantise",
-    version=13,
-    reads=("sfm", "train", "prune"),
-    settings_type=QuantiseSettings,
-    run=run,
-    load=load,
-)

@@ -41,7 +41,7 @@ def without_compensation(splats: Splats, cameras: Sequence[Camera]) -> Splats:
 def mean_compensation(splats: Splats, cameras: Sequence[Camera]) -> NDArray[np.float64]:
     """[N] factor of each splat's opacity, averaged over the cameras whose picture holds its mean;
     over the cameras in front of which it lies if there is none; 1 if there is none either."""
-    from stages.raster.reference import parameters_of, project
+    from stages.raster.reference import parameters_of, project  # it loads torch
 
     opaque = replace(splats, opacity_logits=np.full(len(splats), _OPAQUE, np.float32))
     settings, parameters = raster_settings_of(splats.with_antialias(True)), parameters_of(opaque)

@@ -35,7 +35,7 @@ from stages.raster.definition import (
     TRANSMITTANCE_MIN,
     RasterSettings,
 )
-from stages.raster.sh import C0, C1, C2, C3
+from stages.raster.sh import C0, basis_columns
 from stages.scene import Camera, Splats
 
 torch_vml.warm_up()
@@ -96,14 +96,7 @@ def rotation_matrices(quaternions: Tensor) -> Tensor:
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
     """[N, (degree + 1)^2] real spherical harmonics of unit directions [N, 3]."""
     x, y, z = directions.unbind(-1)
-    xx, yy, zz = x * x, y * y, z * z
-    columns = [torch.full_like(x, C0), -C1 * y, C1 * z, -C1 * x]
-    columns += [C2[0] * x * y, -C2[0] * y * z, C2[1] * (2 * zz - xx - yy)]
-    columns += [-C2[0] * x * z, C2[2] * (xx - yy)]
-    columns += [-C3[0] * y * (3 * xx - yy), C3[1] * x * y * z, -C3[2] * y * (4 * zz - xx - yy)]
-    columns += [C3[3] * z * (2 * zz - 3 * xx - 3 * yy), -C3[2] * x * (4 * zz - xx - yy)]
-    columns += [C3[4] * z * (xx - yy), -C3[0] * x * (xx - 3 * yy)]
-    return torch.stack(columns[: (degree + 1) ** 2], -1)
+    return torch.stack([torch.full_like(x, C0), *basis_columns(x, y, z, degree)], -1)
 
 
 def colours(p: Parameters, camera_centre: Tensor, degree: int) -> Tensor:

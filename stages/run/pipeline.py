@@ -16,7 +16,6 @@ from pathlib import Path
 from threading import Event
 from typing import Any
 
-from stages import STAGE_NAMES, load_stage
 from stages.base.errors import Family, Interrupted, RunFolderError, SplatError, UsageError
 from stages.base.interrupt import stop_on_signals
 from stages.base.settings import check_settings
@@ -29,6 +28,7 @@ from stages.run.lock import holder
 from stages.run.manifest import Manifest
 from stages.run.planning import PHOTOS, Planner, Step
 from stages.run.runfile import RunFile
+from stages.run.stages import STAGES
 from stages.run.workspace import Layout
 
 __all__ = ["Listener", "Pipeline", "Step"]
@@ -44,7 +44,7 @@ class Pipeline:
     def __init__(
         self, run_folder: Path, photos: Path | None = None, stages: Sequence[Stage] | None = None
     ) -> None:
-        every = tuple(stages) if stages else tuple(load_stage(name) for name in STAGE_NAMES)
+        every = tuple(stages) if stages else STAGES
         self.run_folder = Path(run_folder)
         self.photos = Path(photos).absolute() if photos is not None else None
         self.layout = Layout(self.run_folder, every)

@@ -101,9 +101,9 @@ class Planner:
         """Records of the user's own files that the stage reads, by input: photographs, masks, depth
         maps, and files that settings name. Named files that were removed after the stage finished
         count as unchanged."""
+        # They load NumPy, which `splat --help` does without.
         from stages.cameras.table import files_of
-        from stages.ingest import depth_files
-        from stages.ingest.masks import mask_folder
+        from stages.ingest import depth_files, masks
 
         done = Manifest.read(self.layout.workspace(stage).final)
         known = done.input_files if done else {}
@@ -114,9 +114,9 @@ class Planner:
             if self._photo_records is None:
                 self._photo_records = record_files(photos, known.get(PHOTOS), users=True)
             found[PHOTOS] = self._photo_records
-            masks = mask_folder(photos, named.get(MASKS))
+            folder = masks.mask_folder(photos, named.get(MASKS))
             depth = depth_files.depth_source(photos, named.get(DEPTH))
-            found_beside = {MASKS: masks, DEPTH: depth}
+            found_beside = {MASKS: folder, DEPTH: depth}
             named |= {name: path for name, path in found_beside.items() if path is not None}
         for name, path in named.items():
             if name in known and not path.exists():

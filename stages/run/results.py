@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from stages.base.errors import UsageError
+from stages.formats import read
+from stages.raster.backends import AUTO, backend_of_settings, runs_here
 from stages.run import runfolder
 from stages.run.pipeline import Pipeline
-
-if TYPE_CHECKING:
-    from stages.scene import Reconstruction, Splats, View
+from stages.scene import Reconstruction, Splats, View, draw_settings_of
 
 _STAGES_WITH_SPLATS = ("seed", "train", "prune", "quantise")
 
@@ -112,9 +112,6 @@ def read_file(file: Path, strict: bool = True) -> Splats:
 
     strict: whether a value that is not finite makes the file unreadable. Raises SplatError.
     """
-    from stages.formats import read
-    from stages.scene import draw_settings_of
-
     splats = read(file, strict=strict)
     views = views_of(run_around(file))
     if not views:
@@ -126,8 +123,6 @@ def read_file(file: Path, strict: bool = True) -> Splats:
 def backend_of_run(pipeline: Pipeline | None) -> str:
     """The backend that was requested for training the run; "auto" without a run, and on a machine
     that cannot use that backend."""
-    from stages.raster.backends import AUTO, backend_of_settings, runs_here
-
     if pipeline is None:
         return AUTO
     requested = backend_of_settings(pipeline.recorded_settings()["train"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,8 +21,6 @@ def load_image(path: Path, width: int, height: int) -> NDArray[np.float32]:
     assumes (pixel centres at +0.5); grey becomes RGB and alpha is dropped. Raises SplatError
     "photo-unreadable" for a file that is missing or does not decode.
     """
-    import cv2
-
     try:
         # Not cv2.imread: it cannot open non-ASCII names on Windows.
         encoded = np.fromfile(path, np.uint8)
@@ -41,8 +40,6 @@ def load_image(path: Path, width: int, height: int) -> NDArray[np.float32]:
 
 def scaled_image(pixels: NDArray[Any], width: int, height: int) -> NDArray[Any]:
     """[height, width, ...] means of `pixels` over the area of each new pixel."""
-    import cv2
-
     if pixels.shape[:2] == (height, width):
         return pixels
     return np.asarray(cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA))

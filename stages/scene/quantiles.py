@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 
 def quantiles(means: NDArray[np.floating], shares: Sequence[float]) -> NDArray[np.float64]:
@@ -30,8 +31,6 @@ def median_spacing(means: NDArray[np.floating]) -> float:
     """The median distance of a centre of means [N, 3] to its nearest neighbour, of centres that
     coincide with no other; 0 if there are no such centres. A sample of the centres is searched
     for, among all."""
-    from scipy.spatial import cKDTree
-
     if len(means) < 2:
         return 0.0
     sample = means[:: max(1, len(means) // _SAMPLE)]

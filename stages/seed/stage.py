@@ -8,19 +8,22 @@ a plane sweep, measured depth and filled cells are added (`seed`).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from stages.base.errors import ReconstructionError, SplatError
-from stages.base.settings import setting
-from stages.base.stage import Report, Stage
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from stages.scene import Reconstruction, Splats
+from stages.base.stage import Report
+from stages.scene import Reconstruction, Splats, draw_settings_of, logit, rgb_to_dc, split_held_out
+from stages.scene.storage import load_splats, save_splats
+from stages.seed.empty_cells import fill_cells
+from stages.seed.measured_depth import measured_points
+from stages.seed.neighbours import mean_neighbour_distance, nearest_distance
+from stages.seed.plane_sweep import plane_sweep_points
+from stages.seed.settings import SeedSettings
+from stages.seed.view_selection import selected_views
 
 OPACITY = 0.1
 NEIGHBOURS = 3
@@ -33,28 +36,11 @@ _SMALLEST_SCALE = 0.1  # x the median scale: duplicates are at distance 0
 _LARGEST_SCALE = 0.05  # x the distance to the nearest camera: 3 degrees to either side
 
 
-@dataclass(frozen=True)
-class SeedSettings:
-    """Settings of the initial splats."""
-
-    keep_outliers: bool = setting(False, "Keep points that look misplaced or are far away.")
-    fill: bool = setting(True, "Add splats where photographs show surfaces without points.")
-
-
 def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report: Report) -> Splats:
     """Splats of SH degree 0 from inputs["sfm"], written to `folder`.
 
     Raises SplatError "seed-too-few-points" if fewer than 50 points are usable.
     """
-    import numpy as np
-
-    from stages.scene import Splats, draw_settings_of, logit, rgb_to_dc, split_held_out
-    from stages.scene.storage import save_splats
-    from stages.seed.empty_cells import fill_cells
-    from stages.seed.measured_depth import measured_points
-    from stages.seed.plane_sweep import plane_sweep_points
-    from stages.seed.view_selection import selected_views
-
     reconstruction: Reconstruction = inputs["sfm"]
     finite: NDArray[np.bool_] = np.all(np.isfinite(reconstruction.points), axis=1)
     reasons: dict[str, NDArray[np.bool_]] = {"not_finite": ~finite}
@@ -106,8 +92,6 @@ def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report:
 
 def load(folder: Path) -> Splats:
     """The splats of a finished folder."""
-    from stages.scene.storage import load_splats
-
     return load_splats(folder)
 
 
@@ -115,10 +99,6 @@ def _outliers(
     reconstruction: Reconstruction, finite: NDArray[np.bool_]
 ) -> dict[str, NDArray[np.bool_]]:
     """Masks [P] of outliers, by reason."""
-    import numpy as np
-
-    from stages.seed.neighbours import nearest_distance
-
     points = np.where(finite[:, None], reconstruction.points, 0.0)
     errors = np.nan_to_num(reconstruction.errors_px, nan=np.inf, posinf=np.inf)
     centres = _camera_centres(reconstruction)
@@ -146,10 +126,6 @@ def _scales(
     The lower bound keeps duplicates from vanishing. The upper bound, an angle seen from the nearest
     camera, keeps isolated points from covering the pictures.
     """
-    import numpy as np
-
-    from stages.seed.neighbours import mean_neighbour_distance, nearest_distance
-
     raw = mean_neighbour_distance(points, NEIGHBOURS)
     positive = raw[raw > 0]
     if not len(positive):
@@ -163,8 +139,6 @@ def _scales(
 
 
 def _camera_centres(reconstruction: Reconstruction) -> NDArray[np.float64]:
-    import numpy as np
-
     return np.array([view.camera.centre for view in reconstruction.views]).reshape(-1, 3)
 
 
@@ -191,8 +165,3 @@ def _too_few(usable: int, points: int) -> SplatError:
         wanted=f"At least {_FEWEST_SPLATS} distinct points to start from.",
         hint="Take more photographs with more overlap of a scene with texture, and start again.",
     )
-
-
-STAGE = Stage(
-    name="seed", version=6, reads=("sfm",), settings_type=SeedSettings, run=run, load=load
-)

@@ -11,111 +11,30 @@ import json
 import shutil
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from stages.base.atomic import replacing
 from stages.base.errors import ReconstructionError
-from stages.base.settings import setting
-from stages.base.stage import Report, Stage
+from stages.base.stage import Report
 from stages.base.text import counted
-
-if TYPE_CHECKING:
-    from stages.scene import Capture, Reconstruction
-    from stages.sfm.worker.chunks import ChunkExecutor
+from stages.scene import Capture, Reconstruction
+from stages.sfm import finish, light, reconstruction_files
+from stages.sfm.checks import acceptance, attempt_runner, fallbacks
+from stages.sfm.checks.gates import MOVE
+from stages.sfm.known import known_cameras
+from stages.sfm.learned.weights import INSTALL, installed
+from stages.sfm.place import metric_scale
+from stages.sfm.place.crs import projected_system
+from stages.sfm.place.metric_scale import KnownScale
+from stages.sfm.reconstruction_files import load_reconstruction
+from stages.sfm.settings import SfmSettings
+from stages.sfm.worker.chunks import ChunkExecutor
+from stages.sfm.worker.job import job_of, prepare_work_folder
 
 _FEWEST_PHOTOGRAPHS = 3
 _FINISHED = "sfm.json"
 _WORK = "work"
-
-
-@dataclass(frozen=True)
-class SfmSettings:
-    """Settings of structure from motion."""
-
-    seed: int = setting(
-        0,
-        "Seed of every random choice; same seed, same result.",
-        panel="Advanced",
-        min=0,
-        max=2**31 - 1,
-    )
-    max_features: int = setting(
-        12_288, "Approximate number of SIFT features in each photograph.", min=100, max=1_000_000
-    )
-    matching: str = setting(
-        "auto",
-        "Pairs of photographs to match: exhaustive (every pair), sequential "
-        "(neighbours in order of name) or auto (those with similar features).",
-        choices=("auto", "exhaustive", "sequential"),
-    )
-    features: str = setting(
-        "auto",
-        "sift; auto (SIFT, and learned features where it leaves photographs out, if they are "
-        "installed); or learned (both from the start).",
-        panel="Advanced",
-        choices=("auto", "sift", "learned"),
-    )
-    allow_partial: bool = setting(
-        False,
-        "Use the best reconstruction found even if it fails the quality gates.",
-        panel="Advanced",
-    )
-    cameras: Path | None = setting(
-        None,
-        "File or folder of known camera poses, of COLMAP, nerfstudio, a synthetic NeRF "
-        "scene, LLFF, OpenSfM, ODM, Bundler, Metashape, RealityScan, Pix4D, ARKit or Polycam; they "
-        "are not estimated.",
-        panel="Known cameras",
-        affects_output=False,  # its content does, and that is an input
-    )
-    split: bool = setting(
-        False,
-        "Use the split into training and test photographs of --cameras.",
-        panel="Known cameras",
-        needs="cameras",
-    )
-    refine_cameras: bool = setting(
-        False,
-        "Refine the poses of --cameras by bundle adjustment; intrinsics stay fixed.",
-        panel="Known cameras",
-        needs="cameras",
-    )
-    metres: bool = setting(
-        False,
-        "The poses of --cameras are in metres, as those of phones' AR sessions are.",
-        panel="Known cameras",
-        needs="cameras",
-    )
-    scale: tuple[str, ...] = setting(
-        (),
-        "Two photographs and the distance between their cameras (metres).",
-        panel="Known cameras",
-        together="A B METRES",
-    )
-    marker: float = setting(
-        0.0,
-        "Side of the ArUco markers in the scene, alone or on a ChArUco board "
-        "(metres); 0: there are none.",
-        panel="Known cameras",
-        min=0.0,
-        max=1000.0,
-    )
-    crs: str = setting(
-        "",
-        "Turn a scene with GPS to this grid: a projected coordinate reference system in metres, "
-        "such as EPSG:25832.",
-        panel="Known cameras",
-        pattern=r"(EPSG:[0-9]{4,6})?",
-        wanted="An EPSG code, such as EPSG:25832.",
-    )
-    max_minutes: float = setting(
-        120.0,
-        "Stop with an error after this time (minutes).",
-        min=0.1,
-        max=100_000,
-        affects_output=False,
-    )
 
 
 def run(
@@ -140,10 +59,6 @@ def run(
 
     Raises SplatError of family RECONSTRUCTION when no reconstruction passes, and Interrupted.
     """
-    from stages.sfm import light, reconstruction_files
-    from stages.sfm.place import metric_scale
-    from stages.sfm.place.crs import projected_system
-
     capture: Capture = inputs["ingest"]
     if settings.crs:
         projected_system(settings.crs)
@@ -175,11 +90,6 @@ def _from_photographs(
     executor: ChunkExecutor | None,
 ) -> tuple[Reconstruction, dict[str, float]]:
     """(the reconstruction, seconds by step)."""
-    from stages.sfm import finish
-    from stages.sfm.checks import acceptance, attempt_runner, fallbacks
-    from stages.sfm.place import metric_scale
-    from stages.sfm.worker.job import job_of, prepare_work_folder
-
     _check_duplicates(capture)
     features = usable_features(settings.features, report)
     work = folder / _WORK
@@ -215,9 +125,6 @@ def _from_known_cameras(
     capture: Capture, settings: SfmSettings, cameras: Path, folder: Path, report: Report
 ) -> tuple[Reconstruction, dict[str, float]]:
     """(the reconstruction, no seconds)."""
-    from stages.sfm.known import known_cameras
-    from stages.sfm.place.metric_scale import KnownScale
-
     deadline = time.monotonic() + 60.0 * settings.max_minutes
     found = known_cameras.reconstruct(
         capture,
@@ -240,15 +147,11 @@ def _from_known_cameras(
 
 def load(folder: Path) -> Reconstruction:
     """The reconstruction of a finished folder; pictures are not opened."""
-    from stages.sfm.reconstruction_files import load_reconstruction
-
     return load_reconstruction(folder)
 
 
 def _check_duplicates(capture: Capture) -> None:
     """Refuse a capture of near-duplicates at once; matching would take minutes to find the same."""
-    from stages.sfm.checks.gates import MOVE
-
     different = len({photo.duplicate_of or photo.source for photo in capture.photos})
     if different < _FEWEST_PHOTOGRAPHS:
         raise ReconstructionError(
@@ -263,8 +166,6 @@ def _check_duplicates(capture: Capture) -> None:
 
 def usable_features(wanted: str, report: Report) -> str:
     """The features to use: "sift" where learned ones are not installed."""
-    from stages.sfm.learned.weights import INSTALL, installed
-
     if wanted == "sift" or installed():
         return wanted
     if wanted == "learned":
@@ -289,8 +190,6 @@ def _report_model(
 
 
 def _write_finished(folder: Path, report: Report) -> None:
-    from stages.base.atomic import replacing
-
     data = {"metrics": report.metrics, "warnings": report.warnings}
     with replacing(folder / _FINISHED) as path:
         path.write_text(json.dumps(data, indent=1, ensure_ascii=False), encoding="utf-8")
@@ -305,8 +204,3 @@ def _load_finished(folder: Path, report: Report) -> Reconstruction:
         report.warn(code, message)
     shutil.rmtree(folder / _WORK, ignore_errors=True)
     return load(folder)
-
-
-STAGE = Stage(
-    name="sfm", version=23, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
-)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri, stdtrit
 
 RESAMPLES = 10_000
 CONFIDENCE = 0.95
@@ -78,7 +79,5 @@ def _resample_weights(random: np.random.Generator, count: int) -> NDArray[np.flo
 
 
 def _widening(count: int) -> float:
-    from scipy.special import ndtri, stdtrit
-
     tail = (1 + CONFIDENCE) / 2
     return float(stdtrit(count - 1, tail) / ndtri(tail) * math.sqrt(count / (count - 1)))

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from stages.base.atomic import replacing
 
@@ -70,8 +71,6 @@ def _image(kind: str, data: bytes, description: str) -> str:
 
 
 def _jpeg(image: NDArray[np.floating]) -> bytes:
-    from PIL import Image
-
     picture = Image.fromarray(np.uint8(np.clip(image, 0, 1) * 255 + 0.5))
     picture.thumbnail((_LARGEST_SIDE, _LARGEST_SIDE))
     file = io.BytesIO()

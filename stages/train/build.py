@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from stages.base.stage import Report
 from stages.base.text import counted
@@ -15,11 +14,9 @@ from stages.scene.light import LEAST_EXPLAINED, NOISE_EV, spread_ev
 from stages.train.camera_refinement import CameraRefinement
 from stages.train.cap import cap_for, splats_determined
 from stages.train.schedule import Schedule
+from stages.train.settings import TrainSettings
 from stages.train.trainer import Trainer
 from stages.train.views import load_views
-
-if TYPE_CHECKING:
-    from stages.train.stage import TrainSettings
 
 
 def make_trainer(

@@ -7,10 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from stages.base.atomic import replacing
+from stages.base.plots import BLUE, ORANGE, new_plot, write_plot
 from stages.evaluate.evaluation import SIZES
 from stages.scene.pictures import scaled_image
 
@@ -25,9 +28,6 @@ def contact_sheet(
     """A PNG with a numbered row for each (name, PSNR in dB at each of `SIZES`, render,
     photograph): photograph, render, absolute error x 4; and a .txt beside it that says which number
     is which photograph, since the picture's font knows only ASCII."""
-    import cv2
-    from PIL import Image
-
     strips, legend = [], []
     for number, (name, decibels, image, truth) in enumerate(rows, 1):
         figures = ", ".join(
@@ -54,8 +54,6 @@ def contact_sheet(
 
 def training_plot(path: Path, history: Sequence[dict[str, Any]]) -> None:
     """A PNG of held-out PSNR (dB) and number of splats over the steps; none without two figures."""
-    from stages.base.plots import BLUE, ORANGE, new_plot, write_plot
-
     points = [h for h in history if "psnr_db" in h]
     if len(points) < 2:
         return

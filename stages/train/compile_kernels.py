@@ -13,20 +13,20 @@ import sys
 import numpy as np
 
 from stages.base.parent import die_with_parent
+from stages.raster.backends import backend_of
+from stages.raster.cpu.rasteriser import CpuRasteriser
+from stages.raster.definition import RasterSettings
+from stages.scene import Camera
+from stages.train.optimiser import LearningRates, new_model
+from stages.train.steps.cpu import CpuStep
+from stages.train.steps.step import StepInput
+from stages.train.views import Level
 
 _SIDE = 16  # pixels
 
 
 def compile_kernels() -> None:
     """All of the CPU backend that every preset uses."""
-    from stages.raster.cpu.rasteriser import CpuRasteriser
-    from stages.raster.definition import RasterSettings
-    from stages.scene import Camera
-    from stages.train.optimiser import LearningRates, new_model
-    from stages.train.steps.cpu import CpuStep
-    from stages.train.steps.step import StepInput
-    from stages.train.views import Level
-
     camera = Camera(_SIDE, _SIDE, _SIDE, _SIDE, _SIDE / 2, _SIDE / 2, np.eye(4))
     parameters = (np.zeros((1, *shape), np.float32) for shape in ((3,), (4,), (3,), (), (4, 3)))
     model = new_model(*parameters)
@@ -44,8 +44,6 @@ def compile_kernels() -> None:
 
 def main(arguments: list[str]) -> int:
     """arguments: the backend that the run will use. Returns the exit status."""
-    from stages.raster.backends import backend_of
-
     die_with_parent()
     gc.disable()  # compilers throw little away: a fourteenth of the time
     if backend_of(arguments[0]).name == "cpu":

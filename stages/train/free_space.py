@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter
 
 from stages.scene import Camera
 
@@ -56,8 +57,6 @@ class FreeSpace:
 
 def known_free_space(seeds: NDArray[np.floating], cameras: Sequence[Camera]) -> FreeSpace:
     """The free space of seeds at positions [N, 3], as seen by the training views."""
-    from scipy.ndimage import minimum_filter
-
     seeds = seeds[np.isfinite(seeds).all(1)]
     cells = tuple(camera.fitted(CELLS) for camera in cameras)
     depths = []

@@ -27,10 +27,10 @@ from stages.train.free_space import FreeSpace, known_free_space
 from stages.train.optimiser import empty_model
 from stages.train.sparsification import Sparsification
 from stages.train.time_limit import TimeLimit
+from stages.train.views import Level, TrainingView
 
 if TYPE_CHECKING:
     from stages.train.trainer import Trainer
-    from stages.train.views import Level, TrainingView
 
 CHECKPOINT_SECONDS = 30.0
 EVALUATIONS = 10  # evenly spaced over the run

@@ -25,10 +25,10 @@ from stages.scene import Camera, Splats, evenly_spaced
 from stages.train.conversion import splats_of, valid_rows
 from stages.train.density import DensityRule
 from stages.train.optimiser import Model, empty_model
+from stages.train.views import TrainingView
 
 if TYPE_CHECKING:
     from stages.train.trainer import Trainer
-    from stages.train.views import TrainingView
 
 SHARES = (0.52, 0.63, 0.74, 0.85)  # of the run, after which a round happens
 LARGEST_ROUND = 0.2  # of the splats

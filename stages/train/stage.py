@@ -9,128 +9,33 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+
+from stages.base.atomic import replacing
 from stages.base.bad_files import reading, stage_output
 from stages.base.errors import QualityError, ResourceError, SplatError
-from stages.base.settings import setting
-from stages.base.stage import Report, Stage
-from stages.formats.output_formats import drawing_setting
-from stages.formats.table import PLAIN
+from stages.base.stage import Report
 from stages.raster.backends import (
-    backend_setting,
-    device_setting,
     report_backend,
     unavailable_backends,
 )
-
-if TYPE_CHECKING:
-    from stages.raster.definition import MemoryFull
-    from stages.scene import Reconstruction, Splats, TrainedSplats
-    from stages.train.trainer import Trainer
-
-
-@dataclass(frozen=True)
-class TrainSettings:
-    steps: int = setting(
-        7000,
-        "Training steps, with one photograph each.",
-        panel="Quality and time",
-        min=1,
-        max=1_000_000,
-    )
-    steps_per_view: int = setting(
-        800,
-        "Training steps for each training view, at most: more fit these views alone. 0: no limit.",
-        panel="Advanced",
-        min=0,
-        max=1_000_000,
-    )
-    train_side: int = setting(
-        800,
-        "Longer side of the photographs in training (pixels).",
-        panel="Quality and time",
-        min=16,
-        max=8192,
-    )
-    sh_degree: int = setting(2, "Degree of view-dependent colour, 0 (none) to 3.", min=0, max=3)
-    max_splats: int = setting(
-        0,
-        "Largest number of splats; those that photographs can spare are removed later. 0: what "
-        "free memory allows, with no more parameters than the photographs have pixel values.",
-        panel="Size",
-        min=0,
-        max=100_000_000,
-    )
-    seconds: float = setting(
-        0.0,
-        "Time limit in seconds, of the whole command: training makes as many steps as "
-        "fit, whatever --steps says, and pruning as many rounds. 0: no limit.",
-        panel="Quality and time",
-        min=0,
-        max=1e7,
-    )
-    smooth: bool = setting(
-        False,
-        "Train under a 3D smoothing filter, so that no detail is finer than the "
-        "photographs show: softer from close by, without needles and specks.",
-    )
-    seed: int = setting(0, "Seed of all random numbers.", min=0, max=2**31 - 1)
-    background: str = setting(
-        "black",
-        "Background in training: black, as in viewers, or any, a random colour at "
-        "each step, for scenes that are drawn over others. Cut-out objects always use any.",
-        panel="Light and masks",
-        choices=("black", "any"),
-    )
-    light: str = setting(
-        "auto",
-        "Bring all photographs to the median exposure and white balance before "
-        "training: auto (if they differ by more than a camera's noise and points agree), on or "
-        "off. Vignetting that points agree about is corrected unless this is off.",
-        panel="Light and masks",
-        choices=("auto", "on", "off"),
-    )
-    refine_in_training: bool = setting(
-        False,
-        "Let training move the cameras of its photographs, and one focal length factor for all: "
-        "for known cameras that are only nearly right.",
-        panel="Known cameras",
-    )
-    drawing: str = drawing_setting()
-    blocks: str = setting(
-        "1",
-        "Divide the scene into this many blocks, train each on the photographs that "
-        "show it, and merge them; auto: one block for about every 250 photographs.",
-        panel="Advanced",
-        pattern=r"auto|[1-9]\d{0,3}",
-        wanted="A whole number of blocks, or auto.",
-    )
-    within: tuple[float, ...] = setting(
-        (),
-        "Densify only inside this rectangle of the ground plane (world units); the "
-        "rest stays as coarse as it is.",
-        together="X0 Z0 X1 Z1",
-        min=-1e30,
-        max=1e30,
-    )
-    backend: str = backend_setting()
-    device: str = device_setting()
-
-    @property
-    def antialias(self) -> bool:
-        """Whether splats are trained to be drawn with opacity compensation."""
-        return self.drawing != PLAIN
-
+from stages.raster.definition import MemoryFull
+from stages.raster.smoothing import smoothed
+from stages.scene import Reconstruction, RefinedCameras, Splats, TrainedSplats
+from stages.scene.storage import load_splats, save_splats
+from stages.train.build import make_trainer
+from stages.train.cap import DEVICE_MEMORY, PHOTOGRAPHS, lower_cap, remove_cap
+from stages.train.checkpoint import remove_checkpoint
+from stages.train.conversion import splats_of
+from stages.train.quality import write_history, write_quality
+from stages.train.settings import TrainSettings
+from stages.train.trainer import Trainer
 
 _TRAINED = "training.json"
-PRESETS: dict[str, TrainSettings] = {
-    "preview": TrainSettings(steps=2000, train_side=480, sh_degree=1, max_splats=60_000),
-    "standard": TrainSettings(steps=7000, train_side=800, sh_degree=2, max_splats=250_000),
-    "best": TrainSettings(steps=30_000, train_side=1600, sh_degree=3),
-}
 
 
 def run(
@@ -140,15 +45,6 @@ def run(
 
     Raises Interrupted, and SplatError: raster-gpu-memory, train-nothing-left.
     """
-    from stages.raster.definition import MemoryFull
-    from stages.raster.smoothing import smoothed
-    from stages.scene import TrainedSplats
-    from stages.train.build import make_trainer
-    from stages.train.cap import lower_cap, remove_cap
-    from stages.train.checkpoint import remove_checkpoint
-    from stages.train.conversion import splats_of
-    from stages.train.quality import write_history, write_quality
-
     if settings.blocks != "1":
         raise ValueError("blocks are runs of their own: stages.distributed.blocks trains them")
     started = time.monotonic()
@@ -212,8 +108,6 @@ def _report_course(trainer: Trainer, report: Report) -> None:
 
 def _report_cap(trainer: Trainer, report: Report) -> None:
     """Whether the cap of splats was lowered or reached."""
-    from stages.train.cap import DEVICE_MEMORY, PHOTOGRAPHS
-
     if trainer.cap < report.metrics["splat_cap"]:
         report.metric("splat_cap", trainer.cap)
         report.metric("splat_cap_from", DEVICE_MEMORY)
@@ -263,9 +157,6 @@ def _nothing_left() -> SplatError:
 
 def save(folder: Path, trained: TrainedSplats) -> None:
     """What `load` reads. Raises SplatError."""
-    from stages.base.atomic import replacing
-    from stages.scene.storage import save_splats
-
     save_splats(folder, trained.splats)
     facts: dict[str, Any] = {"dropout": trained.dropout}
     if trained.cameras is not None:
@@ -277,11 +168,6 @@ def save(folder: Path, trained: TrainedSplats) -> None:
 
 def load(folder: Path) -> TrainedSplats:
     """The result of a finished folder. Raises SplatError if it is damaged."""
-    import numpy as np
-
-    from stages.scene import RefinedCameras, TrainedSplats
-    from stages.scene.storage import load_splats
-
     splats, cameras = load_splats(folder), None
     with reading(folder / _TRAINED, stage_output("train-folder-damaged")):
         facts = json.loads((folder / _TRAINED).read_text(encoding="utf-8"))
@@ -289,8 +175,3 @@ def load(folder: Path) -> TrainedSplats:
             poses = {name: np.array(pose, np.float64) for name, pose in found["poses"].items()}
             cameras = RefinedCameras(poses, float(found["focal_factor"]))
         return TrainedSplats(splats, bool(facts["dropout"]), cameras)
-
-
-STAGE = Stage(
-    name="train", version=30, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
-)

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline
 
 from stages.scene import Camera, Splats
 from stages.scene.rotations import matrices_of, quaternions_of
@@ -121,8 +122,6 @@ def _lengths(a: NDArray[np.float64], b: NDArray[np.float64], reach: float) -> ND
 def _spline(keys: NDArray[np.float64], spans: NDArray[np.float64]) -> NDArray[np.float64]:
     """[M, 7] dense samples of the Catmull-Rom spline through keys [K, 7] with knots `spans` [K - 1]
     apart, quaternions of length 1."""
-    from scipy.interpolate import CubicHermiteSpline
-
     ends = np.concatenate([[0.0], np.cumsum(spans)])
     tangents = np.gradient(keys, ends, axis=0)  # for uneven knots those of Catmull and Rom
     shares = np.linspace(0.0, 1.0, _SAMPLES, endpoint=False)

@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from stages.base.errors import SplatError
 from stages.base.stage import DrawView, Numbers
@@ -239,8 +240,6 @@ def _plain(shot: PageCamera, points: NDArray[np.floating]) -> dict[str, Any]:
 
 
 def _encoded(frame: Frame) -> dict[str, Any]:
-    from PIL import Image
-
     file = BytesIO()
     Image.fromarray(frame.pixels).save(file, "JPEG", quality=JPEG_QUALITY, subsampling=0)
     text = base64.b64encode(file.getvalue()).decode("ascii")

@@ -5,15 +5,13 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 from stages.base.stage import DrawView, Numbers, Stage
+from stages.page.cameras import page_cameras
 from stages.run.manifest import Manifest
 from stages.run.pipeline import Listener, Pipeline
-
-if TYPE_CHECKING:
-    from stages.viewer.live_page import LivePage
-    from stages.viewer.server import LocalServer
+from stages.viewer.live_page import LivePage
+from stages.viewer.server import LocalServer
 
 _STAGE = "train"
 _GRACE_PERIOD_S = 5.0  # for an open page to fetch the last state; it polls about twice a second
@@ -39,9 +37,6 @@ class LiveTraining(Listener):
     def started(self, stage: Stage, number: int, reason: str, resumed: bool) -> None:
         if stage.name != _STAGE:
             return
-        from stages.page.cameras import page_cameras
-        from stages.viewer.live_page import LivePage
-        from stages.viewer.server import LocalServer
 
         sfm, seeds = self._pipeline.load("sfm"), self._pipeline.load("seed")
         title = self._pipeline.run_folder.absolute().name

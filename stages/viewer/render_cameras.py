@@ -6,13 +6,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from stages.base.errors import UsageError
 from stages.base.text import counted
-
-if TYPE_CHECKING:
-    from stages.scene import Camera, Splats, View
+from stages.cameras.table import read_cameras
+from stages.scene import Camera, Splats, View
+from stages.scene.framing import front_camera
+from stages.viewer import camera_paths, orbit
 
 _TURN_S = 8.0  # the default duration of one turn around the scene
 _SHORTEST_S, _LONGEST_S = 4.0, 40.0  # default durations of other paths
@@ -57,8 +57,6 @@ def camera_of_view(splats: Splats, views: Sequence[View], name: str | None) -> C
 
     Raises SplatError "render-camera".
     """
-    from stages.scene.framing import front_camera
-
     if name is None:
         return views[0].camera if views else front_camera(splats)
     for candidates in (
@@ -101,9 +99,6 @@ def path_cameras(
 
 
 def _orbit(cameras: list[Camera], splats: Splats, duration: Duration) -> CameraPath:
-    from stages.scene.framing import front_camera
-    from stages.viewer import orbit
-
     cameras = cameras or [front_camera(splats)]
     half = orbit.arc_seen(cameras, splats)[1]
     notes: tuple[str, ...] = ()
@@ -119,8 +114,6 @@ def _orbit(cameras: list[Camera], splats: Splats, duration: Duration) -> CameraP
 
 
 def _past_views(cameras: list[Camera], splats: Splats, duration: Duration) -> list[Camera]:
-    from stages.viewer import camera_paths
-
     if not cameras:
         raise UsageError(
             "render-no-capture",
@@ -135,8 +128,6 @@ def _past_views(cameras: list[Camera], splats: Splats, duration: Duration) -> li
 
 
 def _interpolated(cameras: list[Camera], splats: Splats, duration: Duration) -> list[Camera]:
-    from stages.viewer import camera_paths
-
     default_s = _TURN_S * camera_paths.length_in_turns(cameras, splats)
     frames = duration.frames_or(min(max(default_s, _SHORTEST_S), _LONGEST_S))
     return list(camera_paths.interpolated(cameras, splats, frames))
@@ -144,8 +135,6 @@ def _interpolated(cameras: list[Camera], splats: Splats, duration: Duration) -> 
 
 def _read_cameras(path: str) -> tuple[list[Camera], tuple[str, ...]]:
     """(the cameras of a file, notes). Raises SplatError."""
-    from stages.cameras.table import read_cameras
-
     if not Path(path).exists():
         raise UsageError(
             "render-path",

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from stages.base.atomic import make_folder, replacing
 from stages.base.errors import ResourceError
@@ -157,8 +158,6 @@ def eight_bits(image: NDArray[np.floating]) -> NDArray[np.uint8]:
 def save_picture(path: Path, pixels: NDArray[np.uint8] | NDArray[np.float32]) -> None:
     """Write colours [H, W, 3] uint8 in the format that the suffix names, or a depth [H, W] float32
     as .tiff: z in world units, 0 for the background. Raises SplatError."""
-    from PIL import Image
-
     with replacing(path) as partial:
         Image.fromarray(pixels).save(partial)
 

@@ -7,14 +7,14 @@ from typing import Any
 
 import pytest
 
-from stages import STAGE_NAMES, load_stage
 from stages.base.errors import SplatError
 from stages.base.settings import Setting, check_settings, setting, settings_of
+from stages.run.stages import STAGE_NAMES, STAGE_OF
 
 EVERY = {
     f"{name}-{setting.name}": (name, setting)
     for name in STAGE_NAMES
-    for setting in settings_of(load_stage(name).settings_type)
+    for setting in settings_of(STAGE_OF[name].settings_type)
 }
 NUMBERS = {key: pair for key, pair in EVERY.items() if pair[1].kind in (int, float)}
 
@@ -30,7 +30,7 @@ class Settings:
 
 
 def with_value(name: str, setting: Setting, value: Any) -> Any:
-    return replace(load_stage(name).settings_type(), **{setting.name: value})
+    return replace(STAGE_OF[name].settings_type(), **{setting.name: value})
 
 
 @pytest.mark.parametrize("key", EVERY)

@@ -22,8 +22,10 @@ from sample_captures.make import ARC_DEGREES, HERE, LENS, TARGET, look_at, scene
 from sample_captures.render import Array, hit, linear_to_srgb, srgb_to_linear, surface
 from stages.base.stage import Report
 from stages.ingest import stage as ingest
+from stages.ingest.settings import IngestSettings
 from stages.scene import Reconstruction
 from stages.sfm import stage as sfm
+from stages.sfm.settings import SfmSettings
 from tests.sfm.truth import centres, similarity
 
 FRAMES, FPS, CRF = 300, 30, 20
@@ -102,8 +104,8 @@ def make_film(path: Path) -> None:
 
 def reconstructed(photos: Path, out: Path) -> tuple[Reconstruction, Report]:
     report = Report()
-    capture = ingest.run({"photos": photos}, ingest.IngestSettings(), out / "1-ingest", report)
-    found = sfm.run({"ingest": capture}, sfm.SfmSettings(), out / "2-sfm", Report())
+    capture = ingest.run({"photos": photos}, IngestSettings(), out / "1-ingest", report)
+    found = sfm.run({"ingest": capture}, SfmSettings(), out / "2-sfm", Report())
     return found, report
 
 

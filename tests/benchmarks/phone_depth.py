@@ -22,13 +22,13 @@ from PIL import Image
 
 from sample_captures import make
 from sample_captures.render import Lens, Shape, hit
-from stages import load_stage
 from stages.base.stage import Report
 from stages.evaluate.evaluation import evaluate, image_renderer, load_evaluation_views
-from stages.ingest.stage import IngestSettings
+from stages.ingest.settings import IngestSettings
 from stages.run.pipeline import Pipeline
+from stages.run.stages import STAGE_OF
 from stages.scene import Splats, draw_settings_of, evenly_spaced
-from stages.train.stage import PRESETS
+from stages.train.settings import PRESETS
 from tests.benchmarks.sample_test_views import PINHOLE, held_out_views_in, poses, render_test_views
 from tests.sample import PHOTOS
 from tests.sfm.room_captures import picture
@@ -126,7 +126,7 @@ def psnr_db(pipeline: Pipeline, folder: Path, preset: str, seed: int) -> list[fl
     work = pipeline.run_folder / f"{preset}-{seed}"
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir()
-    splats: Splats = load_stage("train").run(inputs, settings, work, Report()).splats
+    splats: Splats = STAGE_OF["train"].run(inputs, settings, work, Report()).splats
     drawn = replace(splats.draw_settings, side=settings.train_side)
     views = load_evaluation_views(
         folder / "test_views",

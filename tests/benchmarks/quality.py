@@ -30,7 +30,6 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from stages import STAGE_NAMES, load_stage
 from stages.base.errors import SplatError
 from stages.base.stage import Report
 from stages.cameras.table import read_cameras
@@ -42,10 +41,11 @@ from stages.evaluate.evaluation import (
     load_evaluation_views,
 )
 from stages.run.pipeline import Pipeline
+from stages.run.stages import STAGE_NAMES, STAGE_OF
 from stages.scene import Reconstruction, Splats, draw_settings_of, split_held_out
-from stages.sfm.stage import SfmSettings
+from stages.sfm.settings import SfmSettings
 from stages.train.build import corrects_light, corrects_vignetting
-from stages.train.stage import PRESETS, TrainSettings
+from stages.train.settings import PRESETS, TrainSettings
 from tests.benchmarks.captures import SOURCES, photographs_of
 from tests.benchmarks.sample_test_views import evaluation_views
 from tests.benchmarks.verdicts import Cell, grouped, read, verdicts, write
@@ -157,7 +157,7 @@ def measured(capture: Capture, preset: str, seed: int, steps: int, side: int) ->
         cell = Cell(**json.loads(kept.read_text(encoding="utf-8")))
         if cell.side == side:
             return cell
-        splats = load_stage("quantise").load(folder / "quantise").splats
+        splats = STAGE_OF["quantise"].load(folder / "quantise").splats
         cell = replace(cell, side=side, scores=scores_of(splats, capture.test_views(side), side))
     else:
         splats, cpu, wall = made(capture, settings, folder)
@@ -174,7 +174,7 @@ def made(capture: Capture, train: TrainSettings, folder: Path) -> tuple[Splats, 
     started, cpu = time.monotonic(), _cpu_seconds()
     outputs: dict[str, Any] = {"sfm": capture.reconstruction, "seed": capture.seeds}
     for name in STAGE_NAMES[3:6]:
-        stage = load_stage(name)
+        stage = STAGE_OF[name]
         place = folder / name
         place.mkdir(parents=True, exist_ok=True)
         settings = train if name == "train" else stage.settings_type()

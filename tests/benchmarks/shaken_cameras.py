@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stages import load_stage
 from stages.base.stage import Report
 from stages.run.pipeline import Pipeline
+from stages.run.stages import STAGE_OF
 from stages.scene import Reconstruction, View, split_held_out, training_extent
-from stages.train.stage import TrainSettings
+from stages.train.settings import TrainSettings
 
 # (mean distance of the moves in extents of the scene, factor of the focal lengths)
 CASES = ((0.0, 1.0), (0.001, 1.0), (0.005, 1.0), (0.02, 1.0), (0.0, 1.01))
@@ -65,7 +65,7 @@ def main() -> None:
             report = Report()
             asked = replace(settings, refine_in_training=refine)
             with tempfile.TemporaryDirectory() as folder:
-                load_stage("train").run(inputs, asked, Path(folder), report)
+                STAGE_OF["train"].run(inputs, asked, Path(folder), report)
             found.append(report.metrics)
         before, after = found
         extent = training_extent(reconstruction)

@@ -14,7 +14,7 @@ from stages.cameras.table import read_cameras
 from stages.evaluate.evaluation import SIZES, EvaluationView
 from stages.evaluate.image_metrics import IDENTICAL_DB
 from stages.raster.draw import raster_settings_of, render
-from stages.sfm.stage import SfmSettings
+from stages.sfm.settings import SfmSettings
 from tests.benchmarks import captures, quality, sizes
 from tests.benchmarks.captures import SOURCES, Source
 from tests.benchmarks.verdicts import Cell, read, verdicts, write

@@ -22,8 +22,10 @@ from numpy.typing import NDArray
 from stages.base.memory import PeakMemory
 from stages.base.stage import Numbers, Report
 from stages.ingest import stage as ingest
+from stages.ingest.settings import IngestSettings
 from stages.scene import View
 from stages.sfm import stage as sfm
+from stages.sfm.settings import SfmSettings
 from tests.benchmarks.hall import Walk, in_hall, through_run
 from tests.sfm.truth import centres, similarity
 
@@ -88,12 +90,12 @@ def measure(walk: Walk, folder: Path) -> str:
     for stage in ("1", "2"):
         shutil.rmtree(folder / stage, ignore_errors=True)
     walk.take(folder / "photos")
-    settings = ingest.IngestSettings()
+    settings = IngestSettings()
     capture = ingest.run({"photos": folder / "photos"}, settings, folder / "1", Report())
     clock = Clock()
     before, report = used(), Report(listener=clock)
     with PeakMemory() as memory:
-        found = sfm.run({"ingest": capture}, sfm.SfmSettings(), folder / "2", report)
+        found = sfm.run({"ingest": capture}, SfmSettings(), folder / "2", report)
     seconds = used() - before
     away = errors_mm(found.views, walk.poses)
     lengths = np.linalg.norm(away, axis=1)

@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-import stages
 from splatcli.app import app
 from stages.base.stage import Stage
 from stages.run import pipeline
+from stages.run.stages import STAGES
 
 Splat = Callable[..., Any]
 
@@ -36,11 +36,13 @@ def pretend(monkeypatch: pytest.MonkeyPatch) -> dict[str, Callable[..., Any]]:
     """Replaces what stages do; an entry under a stage's name replaces that one's `run`."""
     runs: dict[str, Callable[..., Any]] = {}
 
-    def load_stage(name: str) -> Stage:
-        real = stages.load_stage(name)
-        return dataclasses.replace(real, run=runs.get(name, _pretend), load=_load)
+    def pretending(real: Stage) -> Stage:
+        def run(*given: Any) -> Any:
+            return runs.get(real.name, _pretend)(*given)
 
-    monkeypatch.setattr(pipeline, "load_stage", load_stage)
+        return dataclasses.replace(real, run=run, load=_load)
+
+    monkeypatch.setattr(pipeline, "STAGES", tuple(map(pretending, STAGES)))
     return runs
 
 

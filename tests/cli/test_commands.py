@@ -170,7 +170,7 @@ def test_status_names_the_process_that_holds_the_lock(splat, pretend) -> None:
 
 
 def test_preset_gives_the_training_settings(splat) -> None:
-    from stages.train.stage import PRESETS
+    from stages.train.settings import PRESETS
 
     splat("process", "photos", "--preset", "preview")
     assert repr(PRESETS["preview"]) == Path("run/4-train/out.ply").read_text()

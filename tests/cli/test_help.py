@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from splatcli.app import app
-from stages import STAGE_NAMES
+from splatcli.app import ENTRIES, app, loaded
 from stages.base.distribution import NAME, VERSION
 from stages.base.settings import PANELS
+from stages.run.stages import STAGE_NAMES
 from tests import processes
 from tests.cli.help_text import help_of
 
@@ -99,6 +99,12 @@ def test_help_lists_every_command_and_shows_examples() -> None:
 def test_every_command_has_help_with_an_example(command: str) -> None:
     text = help_of(command)
     assert f"splat {command}" in text.split("Example:")[1]
+
+
+@pytest.mark.parametrize("name", ENTRIES)
+def test_the_list_of_commands_has_the_first_line_of_each_commands_help(name: str) -> None:
+    first = (loaded(name).help or "").split("\n\n")[0]
+    assert " ".join(first.split()) == ENTRIES[name].help
 
 
 def test_process_has_the_promised_options() -> None:

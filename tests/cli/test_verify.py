@@ -18,7 +18,7 @@ from stages import formats
 from stages.base.errors import SplatError
 from stages.run import results
 from stages.scene import ExportedAssets, ExportedFile, QuantisedSplats, Splats
-from stages.train.stage import TrainSettings
+from stages.train.settings import TrainSettings
 from tests.small_scene import SmallScene, small_scene
 
 

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatcli.commands import process
-from stages import STAGE_NAMES, load_stage
+from splatcli.distribution import distributed
 from stages.base.errors import Interrupted, SplatError
 from stages.distributed import blocks, partition
 from stages.distributed.tasks import SerialExecutor, TaskResult
 from stages.run.pipeline import Listener, Pipeline
+from stages.run.stages import STAGE_NAMES, STAGE_OF
 from stages.scene import save_splats, split_held_out
 from stages.sfm.reconstruction_files import save_reconstruction
 from tests.small_scene import small_scene
@@ -56,14 +56,14 @@ def pipeline_at(run_folder: Path, photos: Path) -> Pipeline:
         save_splats(folder, start.with_sh_degree(0))
 
     known = {"ingest": lambda *given: None, "sfm": sfm, "seed": seed}
-    stages = [load_stage(name) for name in STAGE_NAMES[:4]]
+    stages = [STAGE_OF[name] for name in STAGE_NAMES[:4]]
     stages = [replace(stage, run=known.get(stage.name, stage.run)) for stage in stages]
     stages[0] = replace(stages[0], load=lambda folder: None)
     return Pipeline(run_folder, photos, stages)
 
 
 def trained(run_folder: Path, photos: Path, listener: Listener | None = None, **asked) -> Pipeline:
-    pipeline = process.distribute(pipeline_at(run_folder, photos), None)
+    pipeline = distributed(pipeline_at(run_folder, photos))
     settings = replace(pipeline.recorded_settings()["train"], **SMALL | asked)
     pipeline.run({"train": settings}, listener=listener)
     return pipeline

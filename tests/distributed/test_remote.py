@@ -20,7 +20,7 @@ from stages.base.errors import SplatError
 from stages.distributed import remote
 from stages.run.request import REQUEST
 from stages.run.runfile import RUN_FILE
-from stages.train import stage as train
+from stages.run.stages import STAGE_OF
 from tests import processes, sample
 from tests.cli.pretence import failing_at
 
@@ -119,12 +119,12 @@ def test_each_checkpoint_is_uploaded_once_and_its_request_only_once(store, tmp_p
     store.put_file = putting
     try:
         (partial / REQUEST).write_text(REQUEST)
-        back.started(train.STAGE, 4, "", False)
+        back.started(STAGE_OF["train"], 4, "", False)
         for steps in (1, 2, 3):
             (partial / "checkpoint.bin").write_text(f"after {steps}")
             os.utime(partial / "checkpoint.bin", ns=(steps, steps))
             for _ in range(3):
-                back.progressed(train.STAGE, "training", steps, 9, {})
+                back.progressed(STAGE_OF["train"], "training", steps, 9, {})
     finally:
         del store.put_file
     assert [PurePosixPath(path).name for path in put] == [

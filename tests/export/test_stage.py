@@ -14,7 +14,7 @@ from stages.base.errors import Family, SplatError
 from stages.base.settings import check_settings
 from stages.base.stage import Report
 from stages.export import stage as export
-from stages.export.stage import ExportSettings
+from stages.export.settings import ExportSettings
 from stages.formats import FORMATS
 from stages.formats import mesh_files as files
 from stages.mesh import fuse

@@ -13,7 +13,7 @@ from stages.raster.definition import RasterSettings
 from stages.raster.draw import render
 from stages.scene import Camera, look_at, scene_extent
 from stages.train import build
-from stages.train import stage as train
+from stages.train.settings import TrainSettings
 from tests.extremes.measured import Measured, broken, difference, worst
 from tests.extremes.oracles import centre_in_picture, inside_clamp, means2d, textbook_picture
 from tests.scenes import camera, cloud, splats, textbook_alpha
@@ -130,7 +130,7 @@ def _coincident_training(backend):
         )
         reconstruction = replace(scene.reconstruction, views=views)
         steps = 4 if backend == "reference" else 30
-        settings = train.TrainSettings(
+        settings = TrainSettings(
             steps=steps, train_side=36, sh_degree=1, max_splats=100, backend=backend
         )
         trainer = build.make_trainer(reconstruction, 40, settings, folder, Report())

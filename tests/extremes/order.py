@@ -13,7 +13,7 @@ from stages.raster.definition import RasterSettings, splat_arrays
 from stages.raster.draw import render
 from stages.raster.kernels.pool import Pool
 from stages.train import build
-from stages.train import stage as train
+from stages.train.settings import TrainSettings
 from stages.train.steps.cpu import CpuStep
 from tests.extremes.measured import Measured, difference, worst
 from tests.scenes import PARAMETERS, camera, cloud, gradients, relative
@@ -121,7 +121,7 @@ def _trained(backend, steps, threads):
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         scene = small_scene(folder, views=5, n=80)
-        settings = train.TrainSettings(
+        settings = TrainSettings(
             steps=steps,
             train_side=72,
             sh_degree=1,

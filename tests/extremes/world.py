@@ -16,6 +16,7 @@ from stages.raster.definition import RasterSettings
 from stages.raster.draw import render
 from stages.scene import Camera, Reconstruction, Splats, View, look_at, scene_extent
 from stages.seed import stage as seed
+from stages.seed.settings import SeedSettings
 from stages.sfm.place.levelling import level_and_recentre
 from tests.extremes.measured import Measured, difference, worst
 from tests.extremes.oracles import centre_in_picture, means2d
@@ -27,7 +28,7 @@ from tests.tolerances import FAR_FROM_ORIGIN_PX, FLOAT32_SHIFT, ROBUST_EXTENT
 OFFSETS = tuple(size * np.array([0.6, -0.48, 0.64]) + (1 / 3, 1 / 7, 0.1) for size in (1e6, 6.4e6))
 OUTLIER = 7e8
 CLAIM_ALL = [suffix for suffix, row in formats.FORMATS.items() if not row.loses]
-BARE = seed.SeedSettings(fill=False)  # these scenes have no photographs
+BARE = SeedSettings(fill=False)  # these scenes have no photographs
 
 
 def world_offset(backend):

@@ -80,7 +80,7 @@ class SmallRun:
 
 
 def names() -> tuple[str, ...]:
-    from stages import STAGE_NAMES
+    from stages.run.stages import STAGE_NAMES
 
     return tuple(STAGE_NAMES)
 

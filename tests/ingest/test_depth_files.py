@@ -21,8 +21,8 @@ from stages.ingest.decode import Decoded, Unusable, readers_set_up
 from stages.ingest.depth_files import read_depth
 from stages.ingest.exif import Exif
 from stages.ingest.find import find
+from stages.ingest.settings import IngestSettings
 from stages.ingest.sources import DepthFile
-from stages.ingest.stage import IngestSettings
 from stages.run.pipeline import Pipeline
 from stages.scene import Camera, Capture
 from stages.scene.pictures import load_depth

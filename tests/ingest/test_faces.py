@@ -18,6 +18,7 @@ from stages.ingest.decode import Decoded
 from stages.ingest.exif import Exif
 from stages.ingest.faces import DIRECTIONS, FIELD_DEG, WIDTHS, face_photos, face_rotation
 from stages.ingest.masking import MaskedPhoto
+from stages.ingest.settings import IngestSettings
 from stages.scene import IGNORE, Camera, Capture, Photo, View, split_held_out
 from stages.scene.rotations import matrices_of
 from tests.ingest.films import film
@@ -74,7 +75,7 @@ def rays(face: Cut) -> np.ndarray:
 
 def ingested(folder: Path, **settings: object) -> tuple[Capture, Report]:
     report = Report()
-    options = ingest.IngestSettings(**settings)  # type: ignore[arg-type]
+    options = IngestSettings(**settings)  # type: ignore[arg-type]
     return ingest.run({"photos": folder}, options, folder.parent / "out", report), report
 
 

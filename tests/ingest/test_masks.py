@@ -14,7 +14,7 @@ from stages.base.stage import Report
 from stages.ingest import stage as ingest
 from stages.ingest.find import find
 from stages.ingest.masks import masks_beside, pair_masks
-from stages.ingest.stage import IngestSettings
+from stages.ingest.settings import IngestSettings
 from stages.scene import Capture
 from stages.scene.pictures import load_image
 from tests.ingest.made_files import exif, folder_of, save, textured

@@ -11,6 +11,7 @@ from PIL import Image
 from stages.base.stage import Report
 from stages.ingest import stage as ingest
 from stages.ingest.panorama import SPHERE, panorama, projection_of
+from stages.ingest.settings import IngestSettings
 from tests.ingest.spheres import sphere, two_fisheyes
 from tests.sfm.checks.bad_captures import SAMPLE
 
@@ -103,7 +104,7 @@ def test_two_fisheyes_among_photographs_are_left_out_by_name(tmp_path: Path) -> 
         Image.fromarray(sphere(number)[:, :300]).save(folder / f"{number}.png")
     Image.fromarray(two_fisheyes(3)).save(folder / "two.png")
     report = Report()
-    capture = ingest.run({"photos": folder}, ingest.IngestSettings(), tmp_path / "out", report)
+    capture = ingest.run({"photos": folder}, IngestSettings(), tmp_path / "out", report)
     assert [photo.name for photo in capture.photos] == ["0.png", "1.png", "2.png"]
     (message,) = [text for code, text in report.warnings if code == "ingest-left-out"]
     assert "two.png is left out: it is a pair of fisheye pictures side by side" in message

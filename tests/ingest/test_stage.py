@@ -20,7 +20,7 @@ from PIL import Image, ImageCms
 from stages.base.errors import Family, Interrupted, SplatError
 from stages.base.stage import Report
 from stages.ingest import stage as ingest
-from stages.ingest.stage import IngestSettings
+from stages.ingest.settings import IngestSettings
 from stages.run.digests import record_files
 from stages.scene import Capture
 from stages.scene.pictures import load_image

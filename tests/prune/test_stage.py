@@ -20,6 +20,7 @@ from stages.evaluate.floaters import near_camera_floaters
 from stages.evaluate.selection import select_removal
 from stages.prune import rounds as pruning
 from stages.prune import stage as prune
+from stages.prune.settings import PruneSettings
 from stages.raster.draw import render
 from stages.scene import IGNORE, Splats, TrainedSplats, View, split_held_out
 from tests.scenes import camera, join, splats
@@ -42,7 +43,7 @@ def run(scene: SmallScene, trained: Splats, folder: Path, **settings) -> tuple[S
     """Without fine-tuning unless it is asked for: splats that stay are then the same."""
     report = Report()
     inputs = {"sfm": scene.reconstruction, "train": TrainedSplats(trained)}
-    wanted = prune.PruneSettings(**{"finetune_steps": 0, **settings})
+    wanted = PruneSettings(**{"finetune_steps": 0, **settings})
     return prune.run(inputs, wanted, folder, report), report
 
 
@@ -87,7 +88,7 @@ def test_stopping_is_heeded_before_the_next_view(scene, tmp_path, monkeypatch, d
         monkeypatch.setattr(module, "capped_psnr_db", score)
     inputs = {"sfm": scene.reconstruction, "train": TrainedSplats(scene.splats)}
     with pytest.raises(Interrupted):
-        prune.run(inputs, prune.PruneSettings(), tmp_path, report)
+        prune.run(inputs, PruneSettings(), tmp_path, report)
     assert len(scored) == drawn
 
 

@@ -12,13 +12,13 @@ from stages import formats
 from stages.base.stage import Report
 from stages.evaluate.evaluation import load_evaluation_views, mean_psnr_db
 from stages.export import stage as export
-from stages.export.stage import ExportSettings
+from stages.export.settings import ExportSettings
 from stages.formats import FORMATS
 from stages.formats.axes import smallest_rotations
 from stages.formats.sog_quantisation import BitDepths, quantise_splats
 from stages.quantise.format_finetuning import FormatFinetuning
 from stages.quantise.rounding import finetune_to_rounding, write_and_read
-from stages.quantise.stage import QuantiseSettings
+from stages.quantise.settings import QuantiseSettings
 from stages.scene import QuantisedSplats, split_held_out, training_extent
 from stages.train.finetune import FineTuner
 from tests.small_scene import SmallScene, small_scene

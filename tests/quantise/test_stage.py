@@ -18,7 +18,7 @@ from stages.evaluate.sh import sufficient_degrees, truncate_sh, truncation_rms
 from stages.formats.sog_quantisation import splats_to_write
 from stages.formats.table import FORMATS
 from stages.quantise import stage as quantise
-from stages.quantise.stage import QuantiseSettings
+from stages.quantise.settings import QuantiseSettings
 from stages.scene import QuantisedSplats, TrainedSplats, dc_to_rgb, split_held_out
 from tests.formats.truth import colour, many_splats
 from tests.small_scene import SmallScene, small_scene

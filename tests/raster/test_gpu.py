@@ -26,7 +26,7 @@ from stages.raster.gpu import device
 from stages.raster.gpu.rasteriser import GpuRasteriser
 from stages.raster.reference_rasteriser import ReferenceRasteriser
 from stages.run import results
-from stages.train.stage import TrainSettings
+from stages.train.settings import TrainSettings
 from tests import processes
 from tests.extremes.gpu import on_gpu
 from tests.extremes.table import ROWS, measured

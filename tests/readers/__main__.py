@@ -21,10 +21,9 @@ from stages.evaluate.image_metrics import psnr
 from stages.formats.values import drop_undrawable
 from stages.proof.checks import read_back
 from stages.proof.compare import differences
-from stages.quantise import stage as quantise
 from stages.raster.draw import render
+from stages.run.stages import STAGE_OF
 from stages.scene import Camera, Splats, View, look_at, split_held_out
-from stages.sfm import stage as sfm
 from tests.packages import UnavailableError, installed
 from tests.readers.engines import (
     ENGINES,
@@ -71,8 +70,8 @@ def _source(path: Path) -> tuple[Splats, tuple[View, ...]]:
         matrix = look_at(eye, middle)
         camera = Camera(*SIZE, SIDE_PX * 1.1, SIDE_PX * 1.1, SIDE_PX / 2, SIDE_PX / 2, matrix)
         return replace(splats, origin=np.zeros(3)), (View("side", "", camera),)
-    reconstruction = sfm.STAGE.load(path / "2-sfm")
-    splats, _ = drop_undrawable(quantise.STAGE.load(path / "6-quantise").splats)
+    reconstruction = STAGE_OF["sfm"].load(path / "2-sfm")
+    splats, _ = drop_undrawable(STAGE_OF["quantise"].load(path / "6-quantise").splats)
     training, held = split_held_out(reconstruction.views)
     chosen = held or training
     views = [chosen[0], chosen[len(chosen) // 2]][: len(chosen)]

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from stages import load_stage
 from stages.raster.kernels import cache
 from stages.run.precompile import PrecompileListener
+from stages.run.stages import STAGE_OF
 from tests import processes
 
 # What training, pruning and judging still compile.
@@ -33,16 +33,19 @@ class Heard(event.Listener):
         pass
 
 event.register("numba:compile", Heard())
-from stages import prune, train
+from stages.prune.settings import PruneSettings
+from stages.prune import stage as prune
+from stages.train.settings import TrainSettings
+from stages.train import stage as train
 from stages.base.stage import Report
 from tests.small_scene import small_scene
 
 folder = Path(sys.argv[1])
 scene = small_scene(folder)
 inputs = {"sfm": scene.reconstruction, "seed": scene.splats}
-settings = train.TrainSettings(steps=60, train_side=72, max_splats=400, backend="cpu")
+settings = TrainSettings(steps=60, train_side=72, max_splats=400, backend="cpu")
 inputs["train"] = train.run(inputs, settings, folder, Report())
-prune.run(inputs, prune.PruneSettings(), folder, Report())
+prune.run(inputs, PruneSettings(), folder, Report())
 print(sorted(names))
 """
 
@@ -62,7 +65,7 @@ def busy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> PrecompileListener:
 
 
 def begin(compiling: PrecompileListener, stage: str) -> None:
-    compiling.started(load_stage(stage), 1, "", False)
+    compiling.started(STAGE_OF[stage], 1, "", False)
 
 
 def helper(compiling: PrecompileListener) -> subprocess.Popen[bytes]:

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from stages.base.stage import Stage
-from stages.prune.stage import PruneSettings
+from stages.prune.settings import PruneSettings
 from stages.run.pipeline import LEAST_S, Pipeline, within_limit
-from stages.train.stage import TrainSettings
+from stages.train.settings import TrainSettings
 from tests.run.fakes import photographs
 
 SLOW = 0.5  # seconds that the first stage takes

@@ -11,6 +11,7 @@ from stages.base.stage import Report
 from stages.scene import Camera, Reconstruction, View, look_at
 from stages.seed import stage as seed
 from stages.seed.empty_cells import CELLS, MARGIN, fill_cells
+from stages.seed.settings import SeedSettings
 
 WIDTH, HEIGHT = 80, 60
 FLOOR = 1.0  # y of the floor; up is -y
@@ -178,13 +179,13 @@ def test_held_out_photographs_lend_nothing(tmp_path: Path) -> None:
     for name in ("with", "without"):
         (tmp_path / name).mkdir()
         report = Report()
-        made.append(seed.run({"sfm": reconstruction}, seed.SeedSettings(), tmp_path / name, report))
+        made.append(seed.run({"sfm": reconstruction}, SeedSettings(), tmp_path / name, report))
         assert len(made[-1]) == len(points) + report.metrics["filled_cells"]
         (tmp_path / reconstruction.views[0].image).unlink(missing_ok=True)
     assert made[0].means.tobytes() == made[1].means.tobytes()
     bare = seed.run(
         {"sfm": replace(reconstruction, folder=Path("nowhere"))},
-        seed.SeedSettings(fill=False),
+        SeedSettings(fill=False),
         tmp_path / "with",
         Report(),
     )

@@ -15,8 +15,9 @@ from stages.base.stage import Report
 from stages.scene import Camera, Reconstruction, Splats, View, dc_to_rgb, look_at
 from stages.seed import stage as seed
 from stages.seed.neighbours import mean_neighbour_distance, nearest_distance
+from stages.seed.settings import SeedSettings
 
-BARE = seed.SeedSettings(fill=False)  # the scenes below have no photographs
+BARE = SeedSettings(fill=False)  # the scenes below have no photographs
 
 
 def grid(side: int = 8, spacing: float = 0.1) -> Reconstruction:

@@ -22,12 +22,13 @@ from stages.base.stage import Report
 from stages.scene import Capture, Reconstruction
 from stages.sfm import stage as sfm
 from stages.sfm.checks import fallbacks
+from stages.sfm.settings import SfmSettings
 from tests import processes
 from tests.sfm import room_captures
 from tests.sfm.checks import bad_captures
 from tests.sfm.truth import TRUTH, centres, similarity
 
-FEW = sfm.SfmSettings(max_features=2000)  # enough for the sample, and quick
+FEW = SfmSettings(max_features=2000)  # enough for the sample, and quick
 
 
 def digests(folder: Path) -> dict[str, str]:
@@ -40,7 +41,7 @@ def digests(folder: Path) -> dict[str, str]:
 
 def failure(capture: Capture, folder: Path, **settings: object) -> SplatError:
     with pytest.raises(SplatError) as error:
-        sfm.run({"ingest": capture}, sfm.SfmSettings(**settings), folder, Report())  # type: ignore[arg-type]
+        sfm.run({"ingest": capture}, SfmSettings(**settings), folder, Report())  # type: ignore[arg-type]
     return error.value
 
 
@@ -300,7 +301,7 @@ def test_two_scenes_are_separated_and_one_may_be_used(
     capture = bad_captures.two_scenes(tmp_path / "in", each=6)
     assert failure(capture, tmp_path, max_features=1500).code == "sfm-separate-groups"
     report = Report()
-    settings = sfm.SfmSettings(max_features=1500, allow_partial=True)
+    settings = SfmSettings(max_features=1500, allow_partial=True)
     found = sfm.run({"ingest": capture}, settings, tmp_path, report)
     assert len(found.views) == 6
     assert len({view.name[0] for view in found.views}) == 1
@@ -359,7 +360,7 @@ def test_killed_at_any_moment_a_run_ends_in_the_same_bytes(
     code = (
         "from pathlib import Path; from stages import sfm; from stages.base.stage import Report;"
         "from tests.sfm import bad_captures as b;"
-        "s = sfm.SfmSettings(max_features=2000);"
+        "s = SfmSettings(max_features=2000);"
         "sfm.run({'ingest': b.sample(9)}, s, Path(sys.argv[1]), Report())"
     )
     folder = tmp_path / "killed"

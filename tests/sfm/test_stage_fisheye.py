@@ -11,9 +11,11 @@ from stages.base.errors import SplatError
 from stages.base.stage import Report
 from stages.ingest import stage as ingest
 from stages.ingest.faces import face_rotation
+from stages.ingest.settings import IngestSettings
 from stages.scene import Reconstruction, split_held_out
 from stages.scene.rotations import quaternions_of
 from stages.sfm import stage as sfm
+from stages.sfm.settings import SfmSettings
 from tests import tolerances
 from tests.benchmarks import fisheyes
 from tests.sfm.truth import off_by
@@ -43,8 +45,8 @@ def reconstructed(
         lines.append(" ".join(map(str, words)) + "\n\n")
     (folder / "cameras" / "images.txt").write_text("".join(lines))
     photos = {"photos": capture / "photos"}
-    found = ingest.run(photos, ingest.IngestSettings(), folder / "1", Report())
-    settings = sfm.SfmSettings(max_features=2000, cameras=folder / "cameras", **more)  # type: ignore[arg-type]
+    found = ingest.run(photos, IngestSettings(), folder / "1", Report())
+    settings = SfmSettings(max_features=2000, cameras=folder / "cameras", **more)  # type: ignore[arg-type]
     report = Report()
     return sfm.run({"ingest": found}, settings, folder / "2", report), report
 

@@ -16,6 +16,7 @@ from stages.scene import Reconstruction, split_held_out
 from stages.scene.place import local_positions
 from stages.scene.rotations import quaternions_of
 from stages.sfm import stage as sfm
+from stages.sfm.settings import SfmSettings
 from tests.sfm.checks import bad_captures
 from tests.sfm.truth import TRUTH, centres, off_by, similarity
 
@@ -41,7 +42,7 @@ def model(folder: Path, change: Callable[[np.ndarray], np.ndarray], count: int) 
 def reconstructed(
     folder: Path, cameras: Path, count: int = 5, **more: object
 ) -> tuple[Reconstruction, Report]:
-    settings = sfm.SfmSettings(max_features=1000, cameras=cameras, **more)  # type: ignore[arg-type]
+    settings = SfmSettings(max_features=1000, cameras=cameras, **more)  # type: ignore[arg-type]
     report = Report()
     inputs = {"ingest": bad_captures.sample(count)}
     return sfm.run(inputs, settings, folder, report), report

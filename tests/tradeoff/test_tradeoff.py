@@ -13,7 +13,8 @@ from stages.base.errors import SplatError
 from stages.base.stage import Report
 from stages.evaluate.evaluation import load_evaluation_views
 from stages.formats import FORMATS
-from stages.prune.stage import PruneSettings, pruner_of
+from stages.prune.settings import PruneSettings
+from stages.prune.stage import pruner_of
 from stages.scene import (
     Camera,
     DrawSettings,

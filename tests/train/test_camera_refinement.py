@@ -12,20 +12,23 @@ from stages.base.errors import Interrupted
 from stages.base.stage import Report
 from stages.evaluate.evaluation import load_evaluation_views, mean_psnr_db
 from stages.prune import stage as prune
+from stages.prune.settings import PruneSettings
 from stages.quantise import stage as quantise
+from stages.quantise.settings import QuantiseSettings
 from stages.raster.cpu.rasteriser import CpuRasteriser
 from stages.raster.definition import RasterSettings
 from stages.scene import Reconstruction, RefinedCameras, TrainedSplats, split_held_out
 from stages.train import stage as train
 from stages.train.camera_refinement import camera_gradients
 from stages.train.conversion import model_of
+from stages.train.settings import TrainSettings
 from stages.train.steps.step import step_of
 from tests.small_scene import small_scene
 
 SETTINGS = RasterSettings(near=0.1, sh_degree=0)
 QUICK = {
-    prune: prune.PruneSettings(rounds=0),
-    quantise: quantise.QuantiseSettings(rounding_steps=0),
+    prune: PruneSettings(rounds=0),
+    quantise: QuantiseSettings(rounding_steps=0),
 }
 
 
@@ -86,7 +89,7 @@ def shaken(scene, size: float, held_out: bool = False) -> Reconstruction:
 def trained(scene, views, folder, report=None, **settings) -> tuple[TrainedSplats, Report]:
     folder.mkdir(exist_ok=True)
     report = report or Report()
-    wanted = train.TrainSettings(
+    wanted = TrainSettings(
         **{"steps": 600, "train_side": 72, "sh_degree": 0, "max_splats": 600} | settings
     )
     given = replace(scene.splats.with_sh_degree(0), opacity_logits=scene.splats.opacity_logits - 1)

@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import pytest
 
-from stages.base import plots
 from stages.train import charts
 
 
@@ -42,13 +41,13 @@ def test_the_plot_of_training_has_axes_units_and_a_legend(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shown: list[Any] = []
-    write = plots.write_plot
+    write = charts.write_plot
 
     def watched(path: Path, figure: Any) -> None:
         shown.append(figure)
         write(path, figure)
 
-    monkeypatch.setattr(plots, "write_plot", watched)
+    monkeypatch.setattr(charts, "write_plot", watched)
     history = [{"step": s, "splats": 10 * s, "psnr_db": 20.0 + s / 100} for s in (100, 200, 300)]
     charts.training_plot(tmp_path / "a.png", history)
     quality, counts = shown[0].axes

@@ -11,7 +11,7 @@ from stages.train.density import AdaptiveDensity, gradient_threshold
 from stages.train.hooks import step_hooks
 from stages.train.optimiser import LearningRates
 from stages.train.schedule import RATE_DECAY_END, RATES_POWER, SCALES, Schedule
-from stages.train.stage import TrainSettings
+from stages.train.settings import TrainSettings
 from stages.train.time_limit import TimeLimit
 from stages.train.trainer import Trainer
 from tests.scenes import camera, cloud

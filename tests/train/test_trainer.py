@@ -17,7 +17,7 @@ from stages.raster.definition import RasterSettings, splat_arrays
 from stages.raster.draw import render
 from stages.raster.smoothing import smoothing_widths
 from stages.scene import DrawSettings, Splats, look_at, split_held_out
-from stages.train import build, cap
+from stages.train import cap
 from stages.train import stage as train
 from stages.train.checkpoint import MAGIC
 from stages.train.clock import Clock, Elapsed
@@ -27,7 +27,7 @@ from stages.train.hooks import EVALUATIONS
 from stages.train.loss import image_loss
 from stages.train.optimiser import LearningRates, apply_gradients, new_model
 from stages.train.schedule import SCALES, Schedule
-from stages.train.stage import TrainSettings
+from stages.train.settings import TrainSettings
 from stages.train.trainer import Trainer
 from stages.train.views import Level, TrainingView, load_views
 from tests.scenes import camera, cloud, splats
@@ -329,10 +329,10 @@ def test_a_run_that_loses_every_splat_ends(tmp_path):
 
 def test_the_stage_says_so_when_nothing_is_left(tmp_path, monkeypatch):
     t, start = small_problem(tmp_path, "none", steps=120)
-    monkeypatch.setattr(build, "make_trainer", lambda *_: t)
+    monkeypatch.setattr(train, "make_trainer", lambda *_: t)
     faint = replace(start, opacity_logits=np.full(len(start), -12.0, np.float32))
     with pytest.raises(SplatError) as error:
-        train.run({"sfm": None, "seed": faint}, train.TrainSettings(), t.folder, Report())
+        train.run({"sfm": None, "seed": faint}, TrainSettings(), t.folder, Report())
     assert error.value.code == "train-nothing-left"
 
 

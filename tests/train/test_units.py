@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stages import load_stage
 from stages.base.stage import Report
+from stages.run.stages import STAGE_OF
 from stages.scene import Reconstruction, Splats
 from stages.train import stage as train
 from stages.train.build import make_trainer
+from stages.train.settings import TrainSettings
 from tests.small_scene import small_scene
 
 
@@ -35,9 +36,9 @@ def splats_in_units(splats: Splats, scale: float) -> Splats:
 @pytest.mark.slow
 def test_a_run_ends_with_the_same_picture_in_any_unit(sample_run: Path, tmp_path: Path) -> None:
     run = sample_run / "run"
-    reconstruction = load_stage("sfm").load(run / "2-sfm")
-    start = load_stage("seed").load(run / "3-seed")
-    settings = train.TrainSettings(steps=400, train_side=160, sh_degree=1, max_splats=8000)
+    reconstruction = STAGE_OF["sfm"].load(run / "2-sfm")
+    start = STAGE_OF["seed"].load(run / "3-seed")
+    settings = TrainSettings(steps=400, train_side=160, sh_degree=1, max_splats=8000)
     found = {}
     for scale in (1.0, 0.999, 1e-6, 1e6):
         inputs = {
@@ -58,7 +59,7 @@ def test_dropout_is_decided_by_the_number_of_views_alone(tmp_path: Path) -> None
         made = small_scene(tmp_path, views).reconstruction
         decisions = [
             make_trainer(
-                in_units(made, scale), 100, train.TrainSettings(max_splats=100), tmp_path, Report()
+                in_units(made, scale), 100, TrainSettings(max_splats=100), tmp_path, Report()
             ).dropout
             for scale in (1.0, 0.999, 1e-6, 1e6)
         ]

@@ -12,12 +12,10 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from stages.base.errors import ResourceError
-
-if TYPE_CHECKING:
-    from stages.raster.definition import MemoryFull
+from stages.raster.definition import MemoryFull
 
 INSTALL = "docs/guide/gpu.md says which build of torch to install."
 _OLDEST = (7, 0)  # compute capability that Triton compiles for
@@ -145,8 +143,6 @@ def gpu_errors_explained(splats: int) -> Iterator[None]:
 
 def out_of_memory(splats: int, free: int, held: int, total: int) -> MemoryFull:
     """The error for splats that did not fit. Bytes: free, held by this process, total."""
-    from stages.raster.definition import MemoryFull
-
     fits = splats // 2
     if total:
         fits = min(int(0.8 * splats), int(0.9 * (free + held) / BYTES_A_SPLAT))

@@ -18,6 +18,8 @@ from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 
+import llvmlite.binding as llvm
+
 KEPT = 3  # folders of compiled kernels, the one in use included
 PACKAGES = ("mesh", "raster", "sfm", "train")  # those with kernels
 _VARIABLE = "NUMBA_CACHE_DIR"
@@ -67,8 +69,6 @@ def prepare() -> None:
 
 
 def _digest() -> str:
-    import llvmlite.binding as llvm
-
     processor = os.environ.get("NUMBA_CPU_NAME") or llvm.get_host_cpu_name()
     features = llvm.get_host_cpu_features().flatten()
     digest = hashlib.sha256("\n".join((sys.version, processor, features)).encode())

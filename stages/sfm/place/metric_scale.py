@@ -14,6 +14,7 @@ from stages.base.errors import ReconstructionError, SplatError, UsageError
 from stages.base.stage import Report
 from stages.cameras.camera_file import NO_GEOREFERENCE, Georeference
 from stages.scene import Camera, Photo
+from stages.sfm.place.crs import turned_to_grid
 from stages.sfm.place.gps import MetricScale, scale_from_gps
 from stages.sfm.place.markers import marker_sides
 
@@ -102,7 +103,6 @@ def _placed(metric: MetricScale | None, known: KnownScale, report: Report) -> Me
             "nor from the file of --cameras.",
         )
         return metric
-    from stages.sfm.place.crs import turned_to_grid
 
     return turned_to_grid(metric, known.crs, report)
 

@@ -17,6 +17,7 @@ def main(arguments: list[str]) -> int:
     """Run the job named on the command line. Returns the exit status (0: done)."""
     die_with_parent()
     job = Job.read(Path(arguments[0]))
+    # COLMAP loads once the process ends with its parent.
     from stages.sfm.known import worker as known_cameras_worker
     from stages.sfm.worker import features, mapping, matching
 

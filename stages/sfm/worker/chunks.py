@@ -16,16 +16,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING
 
 from stages.base import threads
 from stages.base.blocks import blocks
 from stages.sfm.worker import database as sqlite
 from stages.sfm.worker.job import Job, chunks_path, selected_pairs_path
+from stages.sfm.worker.pairs import Pair
 from stages.sfm.worker.process import run_worker
-
-if TYPE_CHECKING:
-    from stages.sfm.worker.pairs import Pair
 
 PHOTOGRAPHS_PER_CHUNK, PAIRS_PER_CHUNK = 16, 128  # some seconds of one core
 CHUNK_MEMORY_MIB = 2560.0  # the pictures of one chunk, or the indexed features that it matches

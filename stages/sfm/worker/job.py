@@ -11,15 +11,13 @@ import shutil
 import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stages.base import threads
-
-if TYPE_CHECKING:
-    from stages.scene import Capture
+from stages.scene import Capture
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,11 @@ import pytest
 from stages.base.errors import SplatError
 from stages.base.stage import Report
 from stages.ingest import stage as ingest
+from stages.ingest.settings import IngestSettings
 from stages.sfm import stage as sfm
 from stages.sfm.checks import acceptance
 from stages.sfm.learned import weights as learned_weights
+from stages.sfm.settings import SfmSettings
 from stages.sfm.worker.pairs import joining_pairs, without_weaker
 from tests.sfm.checks import bad_captures
 from tests.sfm.truth import TRUTH, centres, similarity
@@ -136,10 +138,8 @@ def test_learned_features_join_photographs_that_sift_leaves_in_pieces(tmp_path: 
     photographs.mkdir()
     for path in sorted(bad_captures.SAMPLE.glob("*.jpg"))[::GAPS]:
         shutil.copy(path, photographs)
-    capture = ingest.run(
-        {"photos": photographs}, ingest.IngestSettings(), tmp_path / "1-ingest", Report()
-    )
-    settings, report = sfm.SfmSettings(), Report()
+    capture = ingest.run({"photos": photographs}, IngestSettings(), tmp_path / "1-ingest", Report())
+    settings, report = SfmSettings(), Report()
     found = sfm.run({"ingest": capture}, settings, tmp_path / "2-sfm", report)
     assert len(found.views) == len(capture.photos)
     sift, joined = report.metrics["registered_by"].values()

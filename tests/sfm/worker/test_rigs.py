@@ -13,9 +13,11 @@ from PIL import Image
 from stages.base.stage import Report
 from stages.ingest import stage as ingest
 from stages.ingest.faces import DIRECTIONS, face_rotation
+from stages.ingest.settings import IngestSettings
 from stages.scene import Capture, Face, Photo
 from stages.scene.rotations import matrices_of, quaternions_of
 from stages.sfm import stage as sfm
+from stages.sfm.settings import SfmSettings
 from stages.sfm.worker import pairs
 from stages.sfm.worker.job import job_of
 from stages.sfm.worker.sparse_model import (
@@ -132,9 +134,9 @@ def test_panoramas_of_the_sample_are_placed_within_two_millimetres(tmp_path: Pat
     folder.mkdir()
     for number in range(panoramas.PANORAMAS):
         panoramas.draw(number, folder, 768)
-    found = ingest.run({"photos": folder}, ingest.IngestSettings(), tmp_path / "1", Report())
+    found = ingest.run({"photos": folder}, IngestSettings(), tmp_path / "1", Report())
     report = Report()
-    reconstruction = sfm.run({"ingest": found}, sfm.SfmSettings(), tmp_path / "2", report)
+    reconstruction = sfm.run({"ingest": found}, SfmSettings(), tmp_path / "2", report)
     assert len(reconstruction.views) == panoramas.PANORAMAS * FACES
     away = np.linalg.norm(panoramas.errors_mm(reconstruction.views), axis=1)
     assert len(away) == panoramas.PANORAMAS

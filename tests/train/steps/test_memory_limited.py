@@ -18,7 +18,7 @@ from stages.train import stage as train
 from stages.train.cap import most_opaque
 from stages.train.loss import channel_means
 from stages.train.optimiser import LearningRates, new_model
-from stages.train.stage import TrainSettings
+from stages.train.settings import TrainSettings
 from stages.train.steps.cpu import CpuStep
 from stages.train.steps.memory_limited import MemoryLimitedStep
 from stages.train.steps.step import StepInput

@@ -1,0 +1,25 @@
+"""Settings of the first splats. Neither NumPy nor torch is imported for them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from stages.base.settings import setting
+from stages.base.stage import Stage, in_module
+
+
+@dataclass(frozen=True)
+class SeedSettings:
+    """Settings of the initial splats."""
+
+    keep_outliers: bool = setting(False, "Keep points that look misplaced or are far away.")
+    fill: bool = setting(True, "Add splats where photographs show surfaces without points.")
+
+
+STAGE = Stage(
+    "seed",
+    version=6,
+    reads=("sfm",),
+    settings_type=SeedSettings,
+    **in_module("stages.seed.stage"),
+)
