@@ -41,7 +41,7 @@ def test_the_plot_of_training_has_axes_units_and_a_legend(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shown: list[Any] = []
-    write = charts.write_plot
+    write = plots.write_plot
 
     def watched(path: Path, figure: Any) -> None:
         shown.append(figure)
