@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-from stages import load_stage
 from stages.base.stage import Report
 from stages.evaluate.evaluation import evaluate, image_renderer, load_evaluation_views
+from stages.run.stages import STAGE_OF
 from stages.scene import Reconstruction, Splats, draw_settings_of
-from stages.seed.stage import SeedSettings
-from stages.train.stage import TrainSettings
+from stages.seed.settings import SeedSettings
+from stages.train.settings import TrainSettings
 from tests.benchmarks import table_in_hall
 from tests.benchmarks.sample_test_views import held_out_views_in, render_test_views
 from tests.turned_worlds import WORLDS, World, in_world, seeds_in_world
@@ -39,16 +39,16 @@ def hall(folder: Path, width: int) -> Prepared:
     made = table_in_hall.capture(folder / "images", width)
     given = table_in_hall.of_walk(made)
     inputs, settings = {"sfm": given}, SeedSettings(fill=False)
-    seeds: Splats = load_stage("seed").run(inputs, settings, folder, Report())
+    seeds: Splats = STAGE_OF["seed"].run(inputs, settings, folder, Report())
     return Prepared(given, replace(made, views=table_in_hall.of_test(made)), seeds)
 
 
 def sample(run: Path, folder: Path) -> Prepared:
     """The sample's `run`, and its hidden views, drawn into `folder` if they are not there."""
-    given: Reconstruction = load_stage("sfm").load(run / "2-sfm")
+    given: Reconstruction = STAGE_OF["sfm"].load(run / "2-sfm")
     render_test_views(folder / "test_views")
     tests = replace(given, folder=folder / "test_views", views=held_out_views_in(given))
-    return Prepared(given, tests, load_stage("seed").load(run / "3-seed"))
+    return Prepared(given, tests, STAGE_OF["seed"].load(run / "3-seed"))
 
 
 def quality(made: Prepared, world: World, settings: TrainSettings) -> tuple[float, float]:
@@ -58,7 +58,7 @@ def quality(made: Prepared, world: World, settings: TrainSettings) -> tuple[floa
         given = in_world(made.given, world, folder / "given")
         tests = in_world(made.tests, world, folder / "tests")
         inputs = {"sfm": given, "seed": seeds_in_world(made.seeds, world)}
-        trained: Splats = load_stage("train").run(inputs, settings, folder, Report()).splats
+        trained: Splats = STAGE_OF["train"].run(inputs, settings, folder, Report()).splats
         drawn = draw_settings_of(given.views, settings.train_side)
         views = load_evaluation_views(tests.folder, tests.views, drawn)
         scores = evaluate(image_renderer(trained, "auto"), views)

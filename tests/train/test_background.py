@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stages import load_stage
 from stages.base.stage import Report
 from stages.evaluate.evaluation import image_renderer, load_evaluation_views
 from stages.evaluate.image_metrics import capped_psnr_db
+from stages.run.stages import STAGE_OF
 from stages.scene import Reconstruction, Splats, draw_settings_of
-from stages.seed.stage import SeedSettings
-from stages.train.stage import TrainSettings
+from stages.seed.settings import SeedSettings
+from stages.train.settings import TrainSettings
 from tests.benchmarks import table_in_hall
 from tests.tolerances import BACKGROUND_DB, LEARNT_LESS_DB, UNLEARNT_DB
 
@@ -28,9 +28,9 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     """(the capture with its test views, the splats of a short run on its walk, its metrics)."""
     made = table_in_hall.capture(tmp_path_factory.mktemp("pictures"), WIDTH)
     given, folder, report = table_in_hall.of_walk(made), tmp_path_factory.mktemp("run"), Report()
-    seeds = load_stage("seed").run({"sfm": given}, SeedSettings(fill=False), folder, Report())
+    seeds = STAGE_OF["seed"].run({"sfm": given}, SeedSettings(fill=False), folder, Report())
     inputs = {"sfm": given, "seed": seeds}
-    splats = load_stage("train").run(inputs, SETTINGS, folder, report).splats
+    splats = STAGE_OF["train"].run(inputs, SETTINGS, folder, report).splats
     return made, splats, report.metrics
 
 

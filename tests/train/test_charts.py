@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from stages.base import plots
 from stages.train import charts
 
 
