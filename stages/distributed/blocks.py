@@ -42,6 +42,7 @@ from stages.scene import (
 from stages.train.build import corrects_light, corrects_vignetting
 from stages.train.dropout import uses_dropout
 from stages.train.finetune import FineTuner
+from stages.train.history import History
 from stages.train.quality import write_history, write_quality
 from stages.train.stage import save
 
@@ -132,7 +133,7 @@ class _BlockTraining:
         views = load_evaluation_views(self.whole.folder, held, settings)
         render = image_renderer(splats, backend_of_settings(self.settings))
         write_quality(render, views, settings, self.whole, folder, self.report)
-        write_history([], [], folder, self.report)
+        write_history(History(), folder, self.report)
 
     def _coarse(self, seeds: Splats, fewer: int) -> Splats:
         settings = replace(

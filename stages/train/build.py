@@ -15,7 +15,7 @@ from stages.train.camera_refinement import CameraRefinement
 from stages.train.cap import cap_for, splats_determined
 from stages.train.schedule import Schedule
 from stages.train.settings import TrainSettings
-from stages.train.trainer import Trainer
+from stages.train.trainer import Trainer, TrainingTask
 from stages.train.views import load_views
 
 
@@ -46,8 +46,6 @@ def make_trainer(
         )
     determined = splats_determined([view.levels[-1].camera for view in train], settings.sh_degree)
     cap = cap_for(folder, settings.max_splats, determined)
-    report.metric("splat_cap", cap.splats)
-    report.metric("splat_cap_from", cap.origin)
     report.metric("splat_cap_free_mib", cap.free_mib)
     extent, backend = training_extent(reconstruction), backend_of_settings(settings)
     refinement = None
@@ -56,29 +54,27 @@ def make_trainer(
         cameras |= {view.name: view.camera for view in held_out}
         refinement = CameraRefinement.of(cameras, extent)
         backend = _on_the_host(backend, report)
-    seconds = settings.seconds and max(settings.seconds - (time.monotonic() - began), 1.0)
-    return Trainer(
-        schedule=Schedule(
-            steps=_limited_steps(settings, len(train), report),
-            extent=extent,
-            sh_degree=settings.sh_degree,
-            n_start=min(n_start, cap.splats),
-            seed=settings.seed,
-        ),
-        train=train,
+    task = TrainingTask(
+        views=train,
         held_out=held_out,
         draw_settings=draw_settings,
-        cap=cap.splats,
         folder=folder,
         report=report,
         smooth=settings.smooth,
-        random_background=settings.background == "any",
+        any_background=settings.background == "any",
         backend=backend,
-        seconds=seconds,
+        seconds=settings.seconds and max(settings.seconds - (time.monotonic() - began), 1.0),
         most_steps=settings.steps_per_view * len(train),
-        refinement=refinement,
         within=settings.within,
     )
+    schedule = Schedule(
+        steps=_limited_steps(settings, len(train), report),
+        extent=extent,
+        sh_degree=settings.sh_degree,
+        n_start=min(n_start, cap.splats),
+        seed=settings.seed,
+    )
+    return Trainer(task, schedule, cap, refinement)
 
 
 def _limited_steps(settings: TrainSettings, views: int, report: Report) -> int:

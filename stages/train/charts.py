@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -16,6 +15,7 @@ from stages.base.atomic import replacing
 from stages.base.plots import BLUE, ORANGE, new_plot, write_plot
 from stages.evaluate.evaluation import SIZES
 from stages.scene.pictures import scaled_image
+from stages.train.history import HistoryEntry
 
 SHEET_COLUMN = 480  # pixels, at most
 ERROR_GAIN = 4.0
@@ -52,18 +52,18 @@ def contact_sheet(
         temporary.write_text("".join(legend), encoding="utf-8")
 
 
-def training_plot(path: Path, history: Sequence[dict[str, Any]]) -> None:
+def training_plot(path: Path, history: Sequence[HistoryEntry]) -> None:
     """A PNG of held-out PSNR (dB) and number of splats over the steps; none without two figures."""
-    points = [h for h in history if "psnr_db" in h]
+    points = [(h.step, h.psnr_db, h.splats) for h in history if h.psnr_db is not None]
     if len(points) < 2:
         return
-    steps = [h["step"] for h in points]
+    steps, psnr_db, splats = zip(*points, strict=True)
     figure, quality = new_plot("Evaluations during training", "step", "held-out PSNR (dB)")
     counts = quality.twinx()
     counts.set_ylabel("splats")
     lines = [
-        *quality.plot(steps, [h["psnr_db"] for h in points], "o-", color=BLUE, ms=4),
-        *counts.plot(steps, [h["splats"] for h in points], "s--", color=ORANGE, ms=3),
+        *quality.plot(steps, psnr_db, "o-", color=BLUE, ms=4),
+        *counts.plot(steps, splats, "s--", color=ORANGE, ms=3),
     ]
     counts.set_ylim(bottom=0)
     counts.yaxis.set_major_formatter("{x:,.0f}")

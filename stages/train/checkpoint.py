@@ -23,6 +23,7 @@ from numpy.lib import format as npy
 from stages.base.atomic import sync_folder
 from stages.raster.backends import backend_of
 from stages.train.clock import Elapsed
+from stages.train.history import HistoryEntry
 from stages.train.optimiser import Model
 
 FILE_NAME = "checkpoint.bin"
@@ -61,7 +62,7 @@ class TrainingState:
         step: number of steps done.
         plan: (steps in all, step of the last change of the plan, share of the run done by then),
             see `schedule.Schedule`.
-        history: results of evaluations.
+        history: the evaluations.
         times: of each entry of the history, and, last, now.
         provenance: one entry for each change of backend or device.
         refinement: of cameras, see `camera_refinement`; None where they stay as they are.
@@ -69,7 +70,7 @@ class TrainingState:
 
     step: int
     plan: tuple[int, int, float]
-    history: list[dict[str, Any]]
+    history: list[HistoryEntry]
     times: list[Elapsed]
     provenance: list[Provenance]
     refinement: dict[str, Any] | None = None
@@ -135,6 +136,7 @@ def _read(file: BinaryIO) -> tuple[Model, TrainingState]:
     """The contents of a whole checkpoint, read from the end of its magic number on."""
     header = json.loads(file.read(int.from_bytes(file.read(8), "little")))
     arrays = [npy.read_array(file, allow_pickle=False) for _ in dataclasses.fields(Model)]
+    header["history"] = [HistoryEntry(**entry) for entry in header["history"]]
     header["times"] = [Elapsed(**entry) for entry in header["times"]]
     header["provenance"] = [Provenance(**entry) for entry in header["provenance"]]
     state = TrainingState(**header | {"plan": tuple(header["plan"])})

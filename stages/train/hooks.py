@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,10 +27,8 @@ from stages.train.free_space import FreeSpace, known_free_space
 from stages.train.optimiser import empty_model
 from stages.train.sparsification import Sparsification
 from stages.train.time_limit import TimeLimit
+from stages.train.trainer import Trainer
 from stages.train.views import Level, TrainingView
-
-if TYPE_CHECKING:
-    from stages.train.trainer import Trainer
 
 CHECKPOINT_SECONDS = 30.0
 EVALUATIONS = 10  # evenly spaced over the run
@@ -46,13 +44,14 @@ class StepHook(Protocol):
 
 def step_hooks(trainer: Trainer, start: Splats) -> list[StepHook]:
     """All hooks of a run that starts from `start`, in the order in which they are called."""
-    adaptive = AdaptiveDensity(len(trainer.train))
-    density: DensityRule = BoundedDensity(adaptive, trainer.within) if trainer.within else adaptive
+    task = trainer.task
+    adaptive = AdaptiveDensity(len(task.views))
+    density: DensityRule = BoundedDensity(adaptive, task.within) if task.within else adaptive
     # Of very many held-out views a part is evaluated, so that it takes less time than training.
-    views = [trainer.held_out[i] for i in evaluation_subset(len(trainer.held_out))]
-    time_limit = TimeLimit(trainer.seconds, trainer.most_steps)
+    views = [task.held_out[i] for i in evaluation_subset(len(task.held_out))]
+    time_limit = TimeLimit(task.seconds, task.most_steps)
     # of the cameras before their refinement, which a resumed run has, too
-    free_space = known_free_space(start.means, [v.levels[-1].camera for v in trainer.train])
+    free_space = known_free_space(start.means, [v.levels[-1].camera for v in task.views])
     return [
         FloaterRemoval(free_space),
         Densification(density),
@@ -89,7 +88,8 @@ class Densification:
         if not schedule.densifies_after(step - 1):
             return
         model = cull(trainer.model)
-        budget = min(schedule.budget(step - 1, trainer.cap), trainer.cap)  # the cap may have fallen
+        cap = trainer.cap.splats  # it may have fallen below the plan
+        budget = min(schedule.budget(step - 1, cap), cap)
         model = self.density.grow(model, budget, gradient_threshold(schedule.steps))
         trainer.replace_model(model.take(morton.morton_order_of(model.means)))
 
@@ -100,15 +100,15 @@ class FinalColourRefit:
 
     def after_step(self, trainer: Trainer, step: int) -> None:
         last = step == trainer.schedule.steps
-        if not last or not needs_colour_refit(trainer.dropout, len(trainer.train)):
+        if not last or not needs_colour_refit(trainer.task.dropout, len(trainer.task.views)):
             return
         model = trainer.model
         trainer.stepper.load(empty_model())  # a device may not hold the model twice
         refit = ColourRefit(
-            rasteriser_of(backend_of(trainer.backend).name),
+            rasteriser_of(backend_of(trainer.task.backend).name),
             trainer.raster_settings(trainer.schedule.sh_degree),
-            lambda: map(_level_with_camera, trainer.train, trainer.cameras),
-            trainer.smooth,
+            lambda: map(_level_with_camera, trainer.task.views, trainer.cameras),
+            trainer.task.smooth,
         )
         trainer.stepper.load(refit.of(model))
 
@@ -130,13 +130,9 @@ class Evaluation:
             return
         began = trainer.clock.elapsed().seconds
         scores = evaluate(trainer.render, self.views)
-        entry: dict[str, Any] = {"step": step, "splats": len(trainer.stepper)}
-        self.time_limit.reserve_for_end(trainer.clock.elapsed().seconds - began)
-        if scores:
-            entry["psnr_db"] = float(np.mean([score.psnr_db for score in scores]))
-            entry["ssim"] = float(np.mean([score.ssim for score in scores]))
-        trainer.history.append(entry)
-        trainer.times.append(trainer.clock.elapsed())
+        elapsed = trainer.clock.elapsed()
+        self.time_limit.reserve_for_end(elapsed.seconds - began)
+        trainer.history.add(step, len(trainer.stepper), scores, elapsed)
 
 
 @dataclass
@@ -148,7 +144,7 @@ class Checkpointing:
 
     def after_step(self, trainer: Trainer, step: int) -> None:
         steps = trainer.schedule.steps
-        stops = trainer.report.stop_requested.is_set() and step < steps
+        stops = trainer.task.report.stop_requested.is_set() and step < steps
         if stops or time.monotonic() - self.last > CHECKPOINT_SECONDS:
             trainer.save(step)
             self.last = time.monotonic()
@@ -165,9 +161,9 @@ class Progress:
             "splats": len(trainer.stepper),
             "loss": round(trainer.loss, 4),
         }
-        if trainer.history and "psnr_db" in trainer.history[-1]:
-            numbers["held_out_psnr_db"] = round(trainer.history[-1]["psnr_db"], 2)
-        trainer.report.progress(step, trainer.schedule.steps, "training", **numbers)
+        if (psnr_db := trainer.history.last_psnr_db) is not None:
+            numbers["held_out_psnr_db"] = round(psnr_db, 2)
+        trainer.task.report.progress(step, trainer.schedule.steps, "training", **numbers)
 
 
 @dataclass(frozen=True)
@@ -181,4 +177,4 @@ class LivePreview:
             image = np.clip(trainer.render(camera, degree), 0.0, 1.0)
             return np.rint(image * 255).astype(np.uint8)
 
-        trainer.report.offer(draw)
+        trainer.task.report.offer(draw)

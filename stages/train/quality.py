@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -23,7 +22,7 @@ from stages.evaluate.evaluation import (
 )
 from stages.scene import DrawSettings, Reconstruction, split_held_out
 from stages.train.charts import contact_sheet, training_plot
-from stages.train.clock import Elapsed
+from stages.train.history import History
 
 
 def write_quality(
@@ -75,19 +74,17 @@ def write_quality(
     contact_sheet(folder / "held_out.png", rows)
 
 
-def write_history(
-    history: Sequence[dict[str, Any]], times: Sequence[Elapsed], folder: Path, report: Report
-) -> None:
+def write_history(history: History, folder: Path, report: Report) -> None:
     """The evaluations during the run as `history.csv` and as a plot. The times, which differ
     between equal runs, go only into the report."""
     rows: list[tuple[object, ...]] = [("step", "splats", "psnr_db", "ssim")]
-    for entry in history:
-        psnr_db, ssim = (entry.get(name, float("nan")) for name in ("psnr_db", "ssim"))
-        rows.append((entry["step"], entry["splats"], f"{psnr_db:.4f}", f"{ssim:.5f}"))
+    for entry in history.entries:
+        psnr_db, ssim = entry.psnr_db or float("nan"), entry.ssim or float("nan")
+        rows.append((entry.step, entry.splats, f"{psnr_db:.4f}", f"{ssim:.5f}"))
     write_csv(folder / "history.csv", rows)
-    training_plot(folder / "training.png", history)
-    both = zip(history, times, strict=True)
-    report.metric("history", [entry | asdict(elapsed) for entry, elapsed in both])
+    training_plot(folder / "training.png", history.entries)
+    both = zip(history.entries, history.times, strict=True)
+    report.metric("history", [entry.figures | asdict(elapsed) for entry, elapsed in both])
 
 
 def _report_scores(by_size: Mapping[str, Sequence[Score]], report: Report) -> None:

@@ -13,7 +13,6 @@ opacities to zero. Here splats are chosen by how much the pictures would change,
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,10 +24,8 @@ from stages.scene import Camera, Splats, evenly_spaced
 from stages.train.conversion import splats_of, valid_rows
 from stages.train.density import DensityRule
 from stages.train.optimiser import Model, empty_model
+from stages.train.trainer import Trainer
 from stages.train.views import TrainingView
-
-if TYPE_CHECKING:
-    from stages.train.trainer import Trainer
 
 SHARES = (0.52, 0.63, 0.74, 0.85)  # of the run, after which a round happens
 LARGEST_ROUND = 0.2  # of the splats
@@ -59,16 +56,17 @@ class Sparsification:
 
     def _sparser(self, trainer: Trainer, model: Model) -> Model:
         """The model after one round."""
-        splats = splats_of(model, trainer.schedule.sh_degree, self.start, trainer.draw_settings)
-        if trainer.smooth:
+        task = trainer.task
+        splats = splats_of(model, trainer.schedule.sh_degree, self.start, task.draw_settings)
+        if task.smooth:
             splats = smoothed(splats, model.smoothing)
-        rows = evenly_spaced(range(len(trainer.train)), MAX_MEASURED_VIEWS)
-        cameras, background = list(trainer.cameras), trainer.draw_settings.background
-        views = (_evaluation_view(trainer.train[row], cameras[row], background) for row in rows)
-        contributions = measure_contributions(splats, views, trainer.backend, truncation=False)
+        rows = evenly_spaced(range(len(task.views)), MAX_MEASURED_VIEWS)
+        cameras, background = list(trainer.cameras), task.draw_settings.background
+        views = (_evaluation_view(task.views[row], cameras[row], background) for row in rows)
+        contributions = measure_contributions(splats, views, task.backend, truncation=False)
         change = contributions.sse * (10 ** (LOSS_DB / len(SHARES) / 10) - 1)
         most = int(LARGEST_ROUND * len(splats))
-        every = len(rows) == len(trainer.train)
+        every = len(rows) == len(task.views)
         removal = select_removal(
             *(splats, contributions, cameras, np.inf, most), change=change, complete=every
         )

@@ -28,9 +28,10 @@ from stages.raster.smoothing import smoothed
 from stages.scene import Reconstruction, RefinedCameras, Splats, TrainedSplats
 from stages.scene.storage import load_splats, save_splats
 from stages.train.build import make_trainer
-from stages.train.cap import DEVICE_MEMORY, PHOTOGRAPHS, lower_cap, remove_cap
+from stages.train.cap import DEVICE_MEMORY, PHOTOGRAPHS, Cap, lower_cap, remove_cap
 from stages.train.checkpoint import remove_checkpoint
 from stages.train.conversion import splats_of
+from stages.train.loop import train
 from stages.train.quality import write_history, write_quality
 from stages.train.settings import TrainSettings
 from stages.train.trainer import Trainer
@@ -51,35 +52,34 @@ def run(
     reconstruction: Reconstruction = inputs["sfm"]
     start: Splats = inputs["seed"]
     trainer = make_trainer(reconstruction, len(start), settings, folder, report)
-    report_backend(report, trainer.backend)
+    task = trainer.task
+    report_backend(report, task.backend)
     report.metric("device", report.device)
     report.metric("unavailable_backends", unavailable_backends(settings.backend))
-    report.metric("training_views", len(trainer.train))
-    report.metric("held_out_views", len(trainer.held_out))
+    report.metric("training_views", len(task.views))
+    report.metric("held_out_views", len(task.held_out))
     try:
-        model = trainer.run(start)
+        model = train(trainer, start)
     except MemoryFull as full:
         raise _does_not_fit(full, lower_cap(folder, full.fits).splats) from full
-    splats = splats_of(model, settings.sh_degree, start, trainer.draw_settings)
+    splats = splats_of(model, settings.sh_degree, start, task.draw_settings)
     if settings.smooth:
         splats = smoothed(splats, trainer.smoothing_widths(splats.means))
     if len(splats) == 0:
         raise _nothing_left()
-    refined = None
+    refined, held_out = None, task.held_out
     if trainer.refinement is not None:
-        trainer.register_held_out()
-        refined = trainer.refinement.result
+        held_out, refined = trainer.registered_held_out(), trainer.refinement.result
         reconstruction = reconstruction.with_cameras(refined)
-    views, draw_settings = trainer.held_out, trainer.draw_settings
-    write_quality(trainer.render, views, draw_settings, reconstruction, folder, report)
-    write_history(trainer.history, trainer.times, folder, report)
-    trained = TrainedSplats(splats, trainer.dropout, refined)
+    write_quality(trainer.render, held_out, task.draw_settings, reconstruction, folder, report)
+    write_history(trainer.history, folder, report)
+    trained = TrainedSplats(splats, task.dropout, refined)
     save(folder, trained)
     remove_checkpoint(folder)
     remove_cap(folder)
     report.metric("splats", len(splats))
     _report_course(trainer, report)
-    _report_cap(trainer, report)
+    _report_cap(trainer.cap, trainer.history.most_splats, len(splats), report)
     report.metric("train_seconds", round(time.monotonic() - started, 1))
     return trained
 
@@ -88,7 +88,7 @@ def _report_course(trainer: Trainer, report: Report) -> None:
     """How many steps were made, and by which backends."""
     report.metric("steps", trainer.schedule.steps)
     report.metric("steps_skipped", int(trainer.stepper.skipped))
-    report.metric("dropout", trainer.dropout)
+    report.metric("dropout", trainer.task.dropout)
     if trainer.refinement is not None:
         moved, turned_deg = trainer.refinement.changes
         report.metric("cameras_moved", moved)
@@ -99,38 +99,37 @@ def _report_course(trainer: Trainer, report: Report) -> None:
     if len(entries) > 1:
         ends = [f" to step {entry.step:,}" for entry in entries[1:]] + [""]
         parts = (f"{e.backend} ({e.device}){end}" for e, end in zip(entries, ends, strict=True))
-        report.metric("trained_by", ", then ".join(parts))
+        trained_by = ", then ".join(parts)
+        report.metric("trained_by", trained_by)
         report.warn(
             "train-several-backends",
-            f"Trained by {report.metrics['trained_by']}: neither backend alone gives these bytes.",
+            f"Trained by {trained_by}: neither backend alone gives these bytes.",
         )
 
 
-def _report_cap(trainer: Trainer, report: Report) -> None:
-    """Whether the cap of splats was lowered or reached."""
-    if trainer.cap < report.metrics["splat_cap"]:
-        report.metric("splat_cap", trainer.cap)
-        report.metric("splat_cap_from", DEVICE_MEMORY)
-    origin = report.metrics["splat_cap_from"]
-    if origin == DEVICE_MEMORY:
+def _report_cap(cap: Cap, densified: int, kept: int, report: Report) -> None:
+    """Whether the cap of splats was lowered or reached. densified: the largest number of splats in
+    the run; kept: their number at its end."""
+    report.metric("splat_cap", cap.splats)
+    report.metric("splat_cap_from", cap.origin)
+    report.metric("densified_splats", densified)
+    if cap.origin == DEVICE_MEMORY:
         report.warn(
             "train-gpu-memory",
-            f"The GPU's memory was full: trained with at most {trainer.cap:,} splats.",
+            f"The GPU's memory was full: trained with at most {cap.splats:,} splats.",
         )
-    densified = max(entry["splats"] for entry in trainer.history)
-    report.metric("densified_splats", densified)
-    if densified < 0.98 * trainer.cap:
+    if densified < 0.98 * cap.splats:
         return
     more = "more memory, or a higher --max-splats, may add detail"
-    if origin == PHOTOGRAPHS:
+    if cap.origin == PHOTOGRAPHS:
         more = (
             "they have as many parameters as the photographs have pixel values; more or larger "
             "photographs may add detail"
         )
     report.warn(
         "train-splat-cap-reached",
-        f"Densification stopped at the cap of {trainer.cap:,} splats, of which the photographs "
-        f"need {report.metrics['splats']:,}; {more}.",
+        f"Densification stopped at the cap of {cap.splats:,} splats, of which the photographs "
+        f"need {kept:,}; {more}.",
     )
 
 

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from stages.train.trainer import Trainer
+from stages.train.trainer import Trainer
 
 PLANS = 50  # plans of a run, at most
 PLAN_STEPS = 10  # fewer do not show how long a step takes
@@ -56,4 +54,4 @@ class TimeLimit:
         if not self.seconds or step == trainer.schedule.steps:
             return
         if steps := self.steps(step, trainer.clock.elapsed().seconds):
-            trainer.schedule = trainer.schedule.replanned(step, steps)
+            trainer.replan(step, steps)

@@ -23,7 +23,6 @@ from stages.scene import Camera, DrawSettings, Splats
 from stages.train.loss import channel_means
 from stages.train.optimiser import Model, new_model
 from stages.train.schedule import SCALES, Schedule
-from stages.train.trainer import Trainer
 from stages.train.views import Level, TrainingView
 from tests.benchmarks.gate import check_kernels
 from tests.benchmarks.scenes import PICTURES, random_scene, trained_scene, view
@@ -37,6 +36,7 @@ from tests.benchmarks.timing import (
     peak_bytes,
     rounds_for,
 )
+from tests.train.pictures import trainer_of
 
 BLENDING = ("blend_tiles", "blend_gradient_tiles")
 LATE = 9_000  # a step with all of the picture and all degrees; steps are small by then
@@ -54,7 +54,7 @@ class Stepper:
         photo = TrainingView("stripes", (level,) * len(SCALES))
         schedule = Schedule(10_000, 1e-3, splats.sh_degree, len(splats), 0)
         folder = Path(tempfile.gettempdir())
-        self.trainer = Trainer(
+        self.trainer = trainer_of(
             schedule,
             [photo],
             [],

@@ -13,6 +13,7 @@ from stages.raster.definition import RasterSettings
 from stages.raster.draw import render
 from stages.scene import Camera, look_at, scene_extent
 from stages.train import build
+from stages.train.loop import train as train_all
 from stages.train.settings import TrainSettings
 from tests.extremes.measured import Measured, broken, difference, worst
 from tests.extremes.oracles import centre_in_picture, inside_clamp, means2d, textbook_picture
@@ -134,7 +135,7 @@ def _coincident_training(backend):
             steps=steps, train_side=36, sh_degree=1, max_splats=100, backend=backend
         )
         trainer = build.make_trainer(reconstruction, 40, settings, folder, Report())
-        model = trainer.run(scene.splats)
+        model = train_all(trainer, scene.splats)
         degenerate = int(not 0 < scene_extent(views) < np.inf)
         removed = 1 - len(model) / len(scene.splats)  # sparsification takes a third
         return degenerate + int(not 0 <= removed < 0.5) + broken(*model.arrays)

@@ -13,6 +13,7 @@ from stages.raster.definition import RasterSettings, splat_arrays
 from stages.raster.draw import render
 from stages.raster.kernels.pool import Pool
 from stages.train import build
+from stages.train.loop import train as train_all
 from stages.train.settings import TrainSettings
 from stages.train.steps.cpu import CpuStep
 from tests.extremes.measured import Measured, difference, worst
@@ -132,5 +133,5 @@ def _trained(backend, steps, threads):
         trainer = build.make_trainer(scene.reconstruction, len(start), settings, folder, Report())
         if backend == "cpu":
             trainer.stepper = CpuStep(CpuRasteriser(Pool(threads)))
-        model = trainer.run(start)
+        model = train_all(trainer, start)
         return [array.copy() for array in vars(model).values()]

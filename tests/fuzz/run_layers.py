@@ -18,6 +18,7 @@ from stages.run.runfile import RUN_FILE, RunFile
 from stages.scene import Capture, Photo, load_splats, save_splats
 from stages.scene.storage import FILE_NAME
 from stages.train import checkpoint
+from stages.train.history import HistoryEntry
 from stages.train.optimiser import new_model
 from tests.formats.truth import many_splats
 from tests.fuzz.layer import SPLATS, Layer
@@ -100,7 +101,7 @@ def _checkpoint(folder: Path) -> None:
     start = many_splats(SPLATS)
     values = (start.means, start.quaternions, start.log_scales, start.opacity_logits, start.sh)
     model = new_model(*(np.asarray(array, np.float32) for array in values))
-    state = checkpoint.TrainingState(7, (30, 0, 0.0), [{"step": 7}], [], [])
+    state = checkpoint.TrainingState(7, (30, 0, 0.0), [HistoryEntry(7, SPLATS)], [], [])
     checkpoint.save_checkpoint(folder, model, state)
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from stages.base import plots
 from stages.train import charts
+from stages.train.history import HistoryEntry
 
 
 @pytest.mark.parametrize("name", ["Кухня 1.jpg", "台所.jpg", "Küche.jpg"])
@@ -49,7 +50,7 @@ def test_the_plot_of_training_has_axes_units_and_a_legend(
         write(path, figure)
 
     monkeypatch.setattr(charts, "write_plot", watched)
-    history = [{"step": s, "splats": 10 * s, "psnr_db": 20.0 + s / 100} for s in (100, 200, 300)]
+    history = [HistoryEntry(s, 10 * s, 20.0 + s / 100) for s in (100, 200, 300)]
     charts.training_plot(tmp_path / "a.png", history)
     quality, counts = shown[0].axes
     assert (quality.get_xlabel(), quality.get_ylabel()) == ("step", "held-out PSNR (dB)")
@@ -60,5 +61,5 @@ def test_the_plot_of_training_has_axes_units_and_a_legend(
 
 
 def test_no_plot_of_training_without_held_out_photographs(tmp_path: Path) -> None:
-    charts.training_plot(tmp_path / "a.png", [{"step": s, "splats": 5} for s in (1, 2, 3)])
+    charts.training_plot(tmp_path / "a.png", [HistoryEntry(s, 5) for s in (1, 2, 3)])
     assert not list(tmp_path.iterdir())

@@ -15,6 +15,7 @@ from stages.train.checkpoint import (
     remove_checkpoint,
     save_checkpoint,
 )
+from stages.train.history import HistoryEntry
 from stages.train.optimiser import Model, new_model
 from tests.scenes import cloud
 
@@ -22,7 +23,7 @@ Warnings = list[tuple[str, str]]
 
 
 def save(folder: Path, step: int) -> None:
-    state = TrainingState(step, (30, 0, 0.0), [{"step": step}], [], [])
+    state = TrainingState(step, (30, 0, 0.0), [HistoryEntry(step, 5)], [], [])
     save_checkpoint(folder, model(step), state)
 
 

@@ -16,10 +16,9 @@ from stages.train.hooks import FinalColourRefit
 from stages.train.loss import channel_means
 from stages.train.optimiser import Model, new_model
 from stages.train.schedule import Schedule
-from stages.train.trainer import Trainer
 from stages.train.views import Level
 from tests.scenes import camera, cloud
-from tests.train.pictures import view_of
+from tests.train.pictures import trainer_of, view_of
 
 SETTINGS = RasterSettings(sh_degree=1)
 NO_WIDTHS = np.zeros(0, np.float32)
@@ -109,7 +108,7 @@ def test_the_last_refit_is_to_the_refined_cameras(tmp_path, monkeypatch):
     refinement.poses[:, 0, 3] = 0.5
     views = [view_of(name, np.zeros((30, 40, 3)), camera(40, 30)) for name in "abc"]
     start = cloud(50, 40, 30, degree=0)
-    made = Trainer(
+    made = trainer_of(
         *(Schedule(100, 10.0, 0, 50, 0), views, [], DrawSettings(near=0.1), 50, tmp_path, Report()),
         backend="cpu",
         refinement=refinement,

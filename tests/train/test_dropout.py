@@ -17,6 +17,7 @@ from stages.train.dropout import (
     noise,
     uses_dropout,
 )
+from stages.train.loop import train as train_all
 from stages.train.loss import channel_means
 from stages.train.optimiser import LearningRates, new_model
 from stages.train.schedule import DENSIFICATION_END, Schedule
@@ -24,10 +25,9 @@ from stages.train.steps import gpu as gpu_step
 from stages.train.steps.cpu import CpuStep
 from stages.train.steps.reference import ReferenceStep
 from stages.train.steps.step import StepInput
-from stages.train.trainer import Trainer
 from stages.train.views import Level
 from tests.scenes import camera, cloud
-from tests.train.pictures import view_of
+from tests.train.pictures import trainer_of, view_of
 
 VIEWS = 20
 
@@ -113,7 +113,7 @@ def test_splats_are_dropped_only_after_densification(tmp_path, monkeypatch):
     start = cloud(60, 40, 30, degree=0, seed=4)
     schedule = Schedule(steps=200, extent=10.0, sh_degree=0, n_start=len(start), seed=0)
     views = [view_of(f"{k}", picture, where) for k in range(4)]
-    made = Trainer(schedule, views, [], DrawSettings(near=0.1), 200, tmp_path, Report())
+    made = trainer_of(schedule, views, [], DrawSettings(near=0.1), 200, tmp_path, Report())
     dropped, step = [], made.stepper.step
 
     def recording(given):
@@ -121,5 +121,5 @@ def test_splats_are_dropped_only_after_densification(tmp_path, monkeypatch):
         return step(given)
 
     monkeypatch.setattr(made.stepper, "step", recording)
-    made.run(start)
+    train_all(made, start)
     assert dropped == [k >= DENSIFICATION_END * 200 for k in range(200)]

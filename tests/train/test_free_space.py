@@ -10,11 +10,11 @@ from stages.scene import DrawSettings, look_at
 from stages.train import hooks
 from stages.train.free_space import ENOUGH_VIEWS_PAST, MIN_VIEWS_PAST, known_free_space
 from stages.train.hooks import FLOATER_REMOVALS
+from stages.train.loop import train as train_all
 from stages.train.optimiser import new_model
 from stages.train.schedule import Schedule
-from stages.train.trainer import Trainer
 from tests.scenes import camera, splats
-from tests.train.pictures import view_of
+from tests.train.pictures import trainer_of, view_of
 
 FAR = 10.0  # a wall, before all cameras
 
@@ -115,12 +115,12 @@ def test_no_floater_is_left_at_the_end_of_training(tmp_path, monkeypatch, steps)
     pictures = np.full((48, 64, 3), 0.5, np.float32)
     views = [view_of(f"{k}", pictures, one) for k, one in enumerate(cameras(3))]
     schedule = Schedule(steps=steps, extent=10.0, sh_degree=0, n_start=len(start), seed=0)
-    made = Trainer(
+    made = trainer_of(
         *(schedule, views, [], DrawSettings(near=0.1), 10_000, tmp_path, Report()), backend="cpu"
     )
     clouds = Clouds()
     monkeypatch.setattr(hooks, "AdaptiveDensity", lambda *_: clouds)
-    model = made.run(start)
+    model = train_all(made, start)
     assert clouds.made == sum(schedule.densifies_after(step) for step in range(steps))
     assert (model.means[:, 2] > 0.5 * FAR).all()
     # of a wall in one colour sparsification may remove a fifth four times

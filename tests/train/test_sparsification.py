@@ -13,11 +13,11 @@ from stages.train import sparsification
 from stages.train.conversion import model_of
 from stages.train.density import AdaptiveDensity, BoundedDensity
 from stages.train.hooks import FLOATER_REMOVALS
+from stages.train.loop import train as train_all
 from stages.train.schedule import DENSIFICATION_END, Schedule
 from stages.train.sparsification import LOSS_DB, SHARES, Sparsification
-from stages.train.trainer import Trainer
 from tests.scenes import camera, cloud, join, splats
-from tests.train.pictures import view_of
+from tests.train.pictures import trainer_of, view_of
 
 STEPS = 300
 WHERE = camera(40, 30)
@@ -48,7 +48,7 @@ def trainer(folder, start, within=(), views=None, draw=NEAR):
     """A run on a noisy picture of `start`, or on other views, that does not densify."""
     schedule = Schedule(steps=STEPS, extent=10.0, sh_degree=0, n_start=len(start), seed=0)
     views = views or [view_of(f"{k}", noisy(drawn(start)), WHERE) for k in range(3)]
-    return Trainer(
+    return trainer_of(
         *(schedule, views, [], draw, len(start), folder, Report()), backend="cpu", within=within
     )
 
@@ -64,10 +64,10 @@ def test_splats_are_removed_after_densification_at_the_planned_steps_only(tmp_pa
     start = cloud(400, 40, 30, degree=0)
     counts = {}
     made = trainer(tmp_path, start)
-    made.report.listener = lambda label, done, total, numbers: counts.update(
+    made.task.report.listener = lambda label, done, total, numbers: counts.update(
         {done: numbers["splats"]} if label == "training" else {}
     )
-    end = made.run(start)
+    end = train_all(made, start)
     half = int(DENSIFICATION_END * STEPS)
     assert len(end) == counts[STEPS] < counts[half]
     fewer = [step for step in range(half + 1, STEPS + 1) if counts[step] < counts[step - 1]]

@@ -12,13 +12,14 @@ from stages.base.stage import Report
 from stages.raster.definition import RasterSettings, splat_arrays
 from stages.raster.draw import render
 from stages.scene import IGNORE, TRANSPARENT, DrawSettings, Splats
+from stages.train.loop import train as train_all
 from stages.train.loss import channel_means
 from stages.train.optimiser import LearningRates, new_model
 from stages.train.schedule import SCALES, Schedule
 from stages.train.steps.step import StepInput, step_of
-from stages.train.trainer import Trainer
 from stages.train.views import Level, TrainingView
 from tests.scenes import BACKENDS, camera, cloud, join, splats
+from tests.train.pictures import trainer_of
 
 WHERE = camera(48, 48)
 LEFT = np.repeat(np.array([255, 0], np.uint8), 24)[None] * np.ones((48, 1), np.uint8)
@@ -71,8 +72,8 @@ def trained(outside: str, folder: Path) -> Splats:
     start = join(red, dark)
     schedule = Schedule(steps=800, extent=10.0, sh_degree=0, n_start=len(start), seed=0)
     draw_settings = DrawSettings(near=0.1)
-    made = Trainer(schedule, [view], [], draw_settings, len(start), folder, Report())
-    model = made.run(start)
+    made = trainer_of(schedule, [view], [], draw_settings, len(start), folder, Report())
+    model = train_all(made, start)
     arrays = model.means, model.quaternions, model.log_scales, model.opacity_logits, model.sh
     return Splats(*arrays, np.zeros(len(model), np.uint8))
 
@@ -102,9 +103,9 @@ def test_what_is_black_is_there_if_a_scene_is_for_any_background(
     view = TrainingView("a", tuple(black for _ in SCALES))
     schedule = Schedule(steps=150, extent=10.0, sh_degree=0, n_start=9, seed=0)
     draw_settings = DrawSettings(near=0.1)
-    made = Trainer(
-        schedule, [view], [], draw_settings, 9, tmp_path, Report(), random_background=over_any
+    made = trainer_of(
+        schedule, [view], [], draw_settings, 9, tmp_path, Report(), any_background=over_any
     )
-    model = made.run(start)
+    model = train_all(made, start)
     opacities = 1 / (1 + np.exp(-model.opacity_logits))
     assert (opacities.mean() > 0.7) == over_any

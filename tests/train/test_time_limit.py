@@ -13,10 +13,9 @@ from stages.train.optimiser import LearningRates
 from stages.train.schedule import RATE_DECAY_END, RATES_POWER, SCALES, Schedule
 from stages.train.settings import TrainSettings
 from stages.train.time_limit import TimeLimit
-from stages.train.trainer import Trainer
 from tests.scenes import camera, cloud
 from tests.small_scene import small_scene
-from tests.train.pictures import view_of
+from tests.train.pictures import trainer_of, view_of
 
 PARTS = ((0, 600), (600, 1500), (1500, 3000))  # steps before, while and after the model grows
 
@@ -108,7 +107,7 @@ def test_densification_takes_the_threshold_of_the_plan(tmp_path, monkeypatch):
     monkeypatch.setattr(AdaptiveDensity, "grow", grow)
     start = cloud(50, 40, 30, degree=0)
     view = view_of("a", np.zeros((30, 40, 3)), camera(40, 30))
-    made = Trainer(
+    made = trainer_of(
         *(Schedule(7000, 10.0, 0, 50, 0), [view] * 3, [], DrawSettings(near=0.1), 50, tmp_path),
         Report(),
         backend="cpu",

@@ -24,15 +24,15 @@ from stages.train.clock import Clock, Elapsed
 from stages.train.conversion import splats_of
 from stages.train.density import AdaptiveDensity, cull
 from stages.train.hooks import EVALUATIONS
+from stages.train.loop import train as train_all
 from stages.train.loss import image_loss
 from stages.train.optimiser import LearningRates, apply_gradients, new_model
 from stages.train.schedule import SCALES, Schedule
 from stages.train.settings import TrainSettings
-from stages.train.trainer import Trainer
 from stages.train.views import Level, TrainingView, load_views
 from tests.scenes import camera, cloud, splats
 from tests.small_scene import small_scene
-from tests.train.pictures import view_of
+from tests.train.pictures import trainer_of, view_of
 
 
 def trainer(views, start, steps, folder, report=None, degree=0, cap=10_000, backend="cpu"):
@@ -42,14 +42,14 @@ def trainer(views, start, steps, folder, report=None, degree=0, cap=10_000, back
         for view in views
     ]
     report = report or Report()
-    return Trainer(
+    return trainer_of(
         schedule, views, held_out, DrawSettings(near=0.1), cap, folder, report, backend=backend
     )
 
 
 def psnr_of(trained):
     """Of the first photograph, drawn as it is now."""
-    return evaluate(trained.render, trained.held_out)[0].psnr_db
+    return evaluate(trained.render, trained.task.held_out)[0].psnr_db
 
 
 def disc_and_square():
@@ -143,16 +143,16 @@ def small_problem(tmp_path, name, report=None, steps=60, backend="cpu"):
 
 def test_training_brings_the_picture_closer(tmp_path):
     t, start = small_problem(tmp_path, "a", steps=200)
-    t._resume(start)
+    t.begin(start)
     before = psnr_of(t)
-    t.run(start)
+    train_all(t, start)
     assert psnr_of(t) > before + 5
 
 
 @pytest.mark.parametrize("stop_at", [1, 17, 43])
 def test_a_stopped_run_goes_on_to_the_same_bytes(tmp_path, stop_at):
     whole, start = small_problem(tmp_path, "whole")
-    wanted = whole.run(start)
+    wanted = train_all(whole, start)
     report = Report()
 
     def stop(label, done, total, numbers):
@@ -162,13 +162,13 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(tmp_path, stop_at):
     report.listener = stop
     first, start = small_problem(tmp_path, "parts", report)
     with pytest.raises(Interrupted):
-        first.run(start)
+        train_all(first, start)
     second, start = small_problem(tmp_path, "parts")
-    found = second.run(start)
-    assert second.report.metrics["resumed_from_step"] >= stop_at
+    found = train_all(second, start)
+    assert second.task.report.metrics["resumed_from_step"] >= stop_at
     for a, b in zip(vars(found).values(), vars(wanted).values(), strict=True):
         assert a.tobytes() == b.tobytes()
-    assert second.history == whole.history
+    assert second.history.entries == whole.history.entries
 
 
 def test_a_time_limit_takes_as_many_steps_as_fit_and_not_many_more(tmp_path, monkeypatch):
@@ -183,7 +183,7 @@ def test_a_time_limit_takes_as_many_steps_as_fit_and_not_many_more(tmp_path, mon
 
     monkeypatch.setattr("stages.train.trainer.Clock", StepClock)
     timed, start = small_problem(tmp_path, "limited", steps=60)
-    timed.seconds = 1.2
+    timed.task = replace(timed.task, seconds=1.2)
     step = timed.step
 
     def counted(number):
@@ -191,7 +191,7 @@ def test_a_time_limit_takes_as_many_steps_as_fit_and_not_many_more(tmp_path, mon
         return step(number)
 
     timed.step = counted
-    timed.run(start)
+    train_all(timed, start)
     assert timed.schedule.steps == pytest.approx(120, abs=6)
     assert timed.clock.steps == timed.schedule.steps
     assert timed.schedule.share(timed.schedule.steps) == pytest.approx(1.0)
@@ -208,21 +208,21 @@ def test_time_goes_on_over_an_interruption_and_each_entry_of_the_history_has_its
 
     report.listener = stop
     with pytest.raises(Interrupted):
-        t.run(start)
+        train_all(t, start)
     second, start = small_problem(tmp_path, "parts", steps=40)
-    second.run(start)
-    seconds = [elapsed.seconds for elapsed in second.times]
-    assert len(second.times) == len(second.history) == EVALUATIONS
+    train_all(second, start)
+    seconds = [elapsed.seconds for elapsed in second.history.times]
+    assert len(second.history.times) == len(second.history.entries) == EVALUATIONS
     assert seconds == sorted(seconds)
     assert 0 < seconds[4] < 100 < seconds[5]
-    assert second.times[-1].cpu_seconds > 300
+    assert second.history.times[-1].cpu_seconds > 300
 
 
 def test_a_live_preview_does_not_change_what_is_trained(tmp_path):
     """Every step drawn, from elsewhere, larger and smaller than the photographs; the model grows on
     the way."""
     alone, start = small_problem(tmp_path, "alone", steps=150)
-    wanted = alone.run(start)
+    wanted = train_all(alone, start)
     drawn: list[np.ndarray] = []
     report = Report()
 
@@ -234,12 +234,12 @@ def test_a_live_preview_does_not_change_what_is_trained(tmp_path):
 
     report.preview = keep
     watched, start = small_problem(tmp_path, "watched", report, steps=150)
-    found = watched.run(start)
+    found = train_all(watched, start)
     assert len(drawn) == 150
     assert len(found) > len(start)
     for a, b in zip(vars(found).values(), vars(wanted).values(), strict=True):
         assert a.tobytes() == b.tobytes()
-    assert watched.history == alone.history
+    assert watched.history.entries == alone.history.entries
 
 
 def test_the_live_preview_is_what_the_reference_draws(tmp_path):
@@ -248,7 +248,7 @@ def test_the_live_preview_is_what_the_reference_draws(tmp_path):
     where = camera(48, 36)
     seen = []
     report.preview = lambda draw: seen.append(draw(where))
-    trained = splats_of(t.run(start), 1, start, t.draw_settings)
+    trained = splats_of(train_all(t, start), 1, start, t.task.draw_settings)
     settings = t.raster_settings(t.schedule.sh_degree)
     image = render(trained, where, settings, backend="reference").image
     levels = np.rint(np.clip(image, 0, 1) * 255)
@@ -259,29 +259,29 @@ def test_the_live_preview_is_what_the_reference_draws(tmp_path):
 def test_a_torn_checkpoint_means_a_fresh_start_and_a_warning(tmp_path):
     report = Report()
     t, start = small_problem(tmp_path, "torn", report)
-    (t.folder / "checkpoint.bin").write_bytes(MAGIC + b"\x00" * 5)
+    (t.task.folder / "checkpoint.bin").write_bytes(MAGIC + b"\x00" * 5)
     wanted, start2 = small_problem(tmp_path, "whole")
-    assert t.run(start).means.tobytes() == wanted.run(start2).means.tobytes()
+    assert train_all(t, start).means.tobytes() == train_all(wanted, start2).means.tobytes()
     assert "train-checkpoint-damaged" in dict(report.warnings)
 
 
 def test_a_run_with_a_damaged_checkpoint_goes_on_from_the_one_before(tmp_path, monkeypatch):
     monkeypatch.setattr("stages.train.hooks.CHECKPOINT_SECONDS", 0.0)
     whole, start = small_problem(tmp_path, "whole", steps=30)
-    wanted = whole.run(start)
+    wanted = train_all(whole, start)
     stopping, report = Report(), Report()
     stopping.listener = lambda label, done, total, numbers: (
         stopping.stop_requested.set() if done == 20 else None
     )
     first, start = small_problem(tmp_path, "parts", stopping, steps=30)
     with pytest.raises(Interrupted):
-        first.run(start)
-    path = first.folder / "checkpoint.bin"
+        train_all(first, start)
+    path = first.task.folder / "checkpoint.bin"
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
     second, start = small_problem(tmp_path, "parts", report, steps=30)
-    found = second.run(start)
+    found = train_all(second, start)
     assert 0 < report.metrics["resumed_from_step"] <= 20
     assert "train-checkpoint-damaged" in dict(report.warnings)
     for a, b in zip(vars(found).values(), vars(wanted).values(), strict=True):
@@ -291,7 +291,7 @@ def test_a_run_with_a_damaged_checkpoint_goes_on_from_the_one_before(tmp_path, m
 def test_the_reference_backend_trains_to_the_same_place(tmp_path):
     fast, start = small_problem(tmp_path, "fast", steps=10)
     slow, _ = small_problem(tmp_path, "slow", steps=10, backend="reference")
-    a, b = fast.run(start), slow.run(start)
+    a, b = train_all(fast, start), train_all(slow, start)
     assert len(a) == len(b)
     # Adam divides a gradient by its own size: where that is rounding noise, steps may differ
     assert np.median(np.abs(a.means - b.means)) < 1e-6
@@ -310,21 +310,21 @@ def test_invalid_rows_at_the_start_do_not_spread(tmp_path):
         start.sh,
         start.sh_degrees,
     )
-    model = t.run(broken)
+    model = train_all(t, broken)
     for array in model.arrays:
         assert np.isfinite(array).all()
     clean, start = small_problem(tmp_path, "clean")
-    clean.run(start)
+    train_all(clean, start)
     assert psnr_of(t) == pytest.approx(psnr_of(clean), abs=1.0)  # of 60 splats one is missing
 
 
 def test_a_run_that_loses_every_splat_ends(tmp_path):
     t, start = small_problem(tmp_path, "none", steps=120)
     faint = np.full(len(start), -12.0, np.float32)
-    model = t.run(replace(start, opacity_logits=faint))
+    model = train_all(t, replace(start, opacity_logits=faint))
     assert len(model) == 0
-    assert len(splats_of(model, 1, start, t.draw_settings)) == 0
-    assert t.history[-1]["splats"] == 0
+    assert len(splats_of(model, 1, start, t.task.draw_settings)) == 0
+    assert t.history.entries[-1].splats == 0
 
 
 def test_the_stage_says_so_when_nothing_is_left(tmp_path, monkeypatch):
@@ -332,7 +332,7 @@ def test_the_stage_says_so_when_nothing_is_left(tmp_path, monkeypatch):
     monkeypatch.setattr(train, "make_trainer", lambda *_: t)
     faint = replace(start, opacity_logits=np.full(len(start), -12.0, np.float32))
     with pytest.raises(SplatError) as error:
-        train.run({"sfm": None, "seed": faint}, TrainSettings(), t.folder, Report())
+        train.run({"sfm": None, "seed": faint}, TrainSettings(), t.task.folder, Report())
     assert error.value.code == "train-nothing-left"
 
 
@@ -491,6 +491,6 @@ def test_pictures_on_disk_train_to_the_same_bytes_as_pictures_in_memory(tmp_path
     models = []
     for name, chosen in (("a", stored), ("b", held)):
         (tmp_path / name).mkdir()
-        models.append(trainer(chosen, scene.splats, 12, tmp_path / name).run(scene.splats))
+        models.append(train_all(trainer(chosen, scene.splats, 12, tmp_path / name), scene.splats))
     for one, other in zip(models[0].arrays, models[1].arrays, strict=True):
         assert one.tobytes() == other.tobytes()

@@ -60,7 +60,7 @@ def test_dropout_is_decided_by_the_number_of_views_alone(tmp_path: Path) -> None
         decisions = [
             make_trainer(
                 in_units(made, scale), 100, TrainSettings(max_splats=100), tmp_path, Report()
-            ).dropout
+            ).task.dropout
             for scale in (1.0, 0.999, 1e-6, 1e6)
         ]
         assert decisions == [views == 16] * 4
