@@ -16,7 +16,7 @@ from stages.raster.backends import backend_of_settings
 from stages.raster.draw import render
 from stages.run.pipeline import Listener, Pipeline
 from stages.run.results import reconstruction_of
-from stages.run.stages import STAGE_NAMES, STAGE_OF
+from stages.run.stages import STAGE_NAMES, STAGE_OF, options_of
 from stages.scene import Camera, ExportedAssets, Reconstruction, Splats
 from stages.train.settings import PRESETS
 from stages.viewer.sinks import eight_bits
@@ -57,7 +57,8 @@ def process(
         run_folder: made if missing; continued if it is a run of the same photographs.
         preset: "preview", "standard" or "best".
         listener: receives progress, if given.
-        options: fields of the stages' settings; a field that several stages have is set in all.
+        options: fields of the stages' settings; `SHARED_OPTIONS` says which stages get a field that
+            several have.
 
     Raises SplatError as `splat process` reports it, TypeError for an unknown option, ValueError
     for an unknown preset.
@@ -69,7 +70,7 @@ def process(
     known = {field.name for found in settings.values() for field in fields(found)}
     if unknown := options.keys() - known:
         raise TypeError(f"no stage has the option {', '.join(sorted(unknown))}")
-    settings = {name: changed(found, options) for name, found in settings.items()}
+    settings = {name: changed(found, options_of(name, options)) for name, found in settings.items()}
     pipeline = Pipeline(run_folder, photos)
     manifests = pipeline.run(settings, listener=listener)
     return Scene(

@@ -13,7 +13,7 @@ from stages.base.settings import Setting, changed, settings_of
 from stages.raster.backends import backend_of, backend_of_settings
 from stages.run.pipeline import Pipeline
 from stages.run.runfolder import is_run_folder
-from stages.run.stages import STAGE_NAMES, STAGE_OF
+from stages.run.stages import STAGE_NAMES, STAGE_OF, options_of
 from stages.train.settings import PRESETS
 
 DEFAULT_PRESET = "standard"
@@ -104,7 +104,8 @@ def recorded(pipeline: Pipeline) -> dict[str, Any]:
 def combined(
     base: Mapping[str, Any], given: Mapping[str, Any], preset: str | None
 ) -> dict[str, Any]:
-    """`base` (settings by stage name) changed by a preset, then by the given options.
+    """`base` (settings by stage name) changed by a preset, then by the given options. The settings
+    of a single stage take all of them, those of several what `SHARED_OPTIONS` says.
 
     Raises SplatError for a value or a combination that is not allowed, and for a backend that is
     not available here.
@@ -112,7 +113,10 @@ def combined(
     chosen = dict(base)
     if preset is not None and "train" in chosen:
         chosen["train"] = PRESETS[preset]
-    found = {name: changed(settings, given) for name, settings in chosen.items()}
+    found = {
+        name: changed(settings, given if len(chosen) == 1 else options_of(name, given))
+        for name, settings in chosen.items()
+    }
     if given.keys() & {"backend", "device"}:  # an error now, not after an hour of other work
         with_backend = [settings for settings in found.values() if hasattr(settings, "backend")]
         for name in {backend_of_settings(settings) for settings in with_backend}:

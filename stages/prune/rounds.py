@@ -68,6 +68,7 @@ class PruningResult:
         least_tenth_db: what the tenth of the splats that contributes least contributed at first.
         stopped_by: RATE_DISTORTION (the rest saves more bits than it costs), LOSS, TIME
             or ROUNDS.
+        forced: whether a target kept a round that cost more than is allowed.
         rounds: all that were tried.
     """
 
@@ -77,6 +78,7 @@ class PruningResult:
     end_db: float
     least_tenth_db: float
     stopped_by: str = ROUNDS
+    forced: bool = False
     rounds: list[PruningRound] = field(default_factory=list)
 
     def add_round(self, removal: Removal, measured_sse: float, psnr_db: Psnr, kept: bool) -> None:
@@ -156,7 +158,9 @@ class Pruner:
             kept = self.targets.allows(after.psnr_db, best_db)
             if excess > 0 or (self.targets.min_psnr_db and not kept):
                 fewer, after = self._finetuned(fewer, after)
-                kept = excess > 0 or self.targets.allows(after.psnr_db, best_db)
+                kept = self.targets.allows(after.psnr_db, best_db)
+                found.forced |= excess > 0 and not kept
+                kept |= excess > 0
             found.add_round(removal, measured, after.psnr_db, kept)
             if kept:
                 found.splats, state = fewer, after

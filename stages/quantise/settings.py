@@ -23,7 +23,7 @@ class QuantiseSettings:
     """Settings of the choice of precision. Of the formats, only those that need fine-tuning are
     kept: a further lossless format changes nothing here."""
 
-    max_loss_db: float = setting(
+    sh_loss_db: float = setting(
         0.02, "PSNR of training views that lower SH degrees may cost (dB).", min=0, max=100
     )
     sog_loss_db: float = setting(

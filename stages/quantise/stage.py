@@ -106,7 +106,7 @@ def run(
     decisions: dict[str, object] = {
         **figures,
         "psnr_sog_training_db": sog_db,
-        "max_loss_db": settings.max_loss_db,
+        "sh_loss_db": settings.sh_loss_db,
         "drawing": settings.drawing,
         "colour_loss_of_255": threshold,
         "views": len(decider.views),
@@ -134,7 +134,7 @@ def _choose_sh_degrees(
     for lower in range(splats.sh_degree):
         candidate = splats.with_sh_degree(lower)
         by_degree[lower] = decider.psnr(candidate)
-        if raw_db - by_degree[lower] < settings.max_loss_db:
+        if raw_db - by_degree[lower] < settings.sh_loss_db:
             kept = candidate
             break
     for threshold in _THRESHOLDS_OF_255 if kept.sh_degree else ():
@@ -142,7 +142,7 @@ def _choose_sh_degrees(
         if np.array_equal(degrees, kept.sh_degrees):
             continue
         candidate = truncate_sh(kept, degrees)
-        if raw_db - decider.psnr(candidate) < settings.max_loss_db:
+        if raw_db - decider.psnr(candidate) < settings.sh_loss_db:
             return candidate, by_degree, threshold
     return kept, by_degree, 0.0
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from stages.base.stage import Stage
 from stages.export.settings import STAGE as EXPORT
 from stages.ingest.settings import STAGE as INGEST
@@ -14,3 +17,19 @@ from stages.train.settings import STAGE as TRAIN
 STAGES: tuple[Stage, ...] = (INGEST, SFM, SEED, TRAIN, PRUNE, QUANTISE, EXPORT)
 STAGE_NAMES = tuple(stage.name for stage in STAGES)
 STAGE_OF = {stage.name: stage for stage in STAGES}
+# Options that several stages have, and the stages that a command for a whole run gives them to.
+SHARED_OPTIONS = {
+    "seed": ("sfm", "train"),  # of every random choice
+    "max_splats": ("train",),  # what `prune` is given by itself is a target, whatever the loss
+    "seconds": ("train", "prune"),  # divided among them, see `pipeline.within_limit`
+    "formats": ("quantise", "export"),  # what is fine-tuned to, and what is written
+    "drawing": ("train", "quantise", "export"),  # trained for, fine-tuned for, and written for it
+    "backend": ("train", "prune", "quantise", "export"),
+    "device": ("train", "prune", "quantise", "export"),
+}
+
+
+def options_of(stage: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Those of the options `given` for a whole run that the stage gets, by name."""
+    every = (stage,)
+    return {name: v for name, v in given.items() if stage in SHARED_OPTIONS.get(name, every)}

@@ -80,13 +80,13 @@ def test_a_scene_without_view_dependence_keeps_sh_degree_0(
 
 
 def test_no_allowance_keeps_what_shows(scene: SmallScene, tmp_path: Path) -> None:
-    result, metrics = decide(scene, tmp_path, max_loss_db=0.0)
+    result, metrics = decide(scene, tmp_path, sh_loss_db=0.0)
     assert metrics["psnr_kept_db"] >= metrics["psnr_raw_db"]
     assert result.splats.sh_degree == 2
 
 
 def test_a_large_allowance_keeps_nothing(scene: SmallScene, tmp_path: Path) -> None:
-    assert decide(scene, tmp_path, max_loss_db=50.0)[0].splats.sh_degree == 0
+    assert decide(scene, tmp_path, sh_loss_db=50.0)[0].splats.sh_degree == 0
 
 
 def test_the_same_inputs_give_the_same_bytes_and_load_gives_the_output(

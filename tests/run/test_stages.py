@@ -1,0 +1,47 @@
+"""The stages as one list, and options that several of them have."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import pytest
+
+from splatcli import run_settings
+from stages.base.settings import settings_of
+from stages.run.stages import SHARED_OPTIONS, STAGE_NAMES, STAGE_OF, STAGES, options_of
+
+
+def test_stages_read_earlier_ones_only() -> None:
+    for number, stage in enumerate(STAGES):
+        assert set(stage.reads) <= set(STAGE_NAMES[:number])
+
+
+def test_every_option_of_several_stages_says_who_gets_it() -> None:
+    counts = Counter(
+        setting.name for stage in STAGES for setting in settings_of(stage.settings_type)
+    )
+    assert {name for name, count in counts.items() if count > 1} == SHARED_OPTIONS.keys()
+    for name, stages in SHARED_OPTIONS.items():
+        for stage in stages:
+            assert name in {s.name for s in settings_of(STAGE_OF[stage].settings_type)}
+
+
+def test_the_cap_of_a_run_is_no_target_of_pruning() -> None:
+    """As a target it would silence the warning that pruning lost too much."""
+    settings = run_settings.of_new_run({"max_splats": 5000})
+    assert settings["train"].max_splats == 5000
+    assert settings["prune"].max_splats == 0
+    alone = run_settings.combined({"prune": settings["prune"]}, {"max_splats": 400}, None)
+    assert alone["prune"].max_splats == 400
+
+
+@pytest.mark.parametrize("drawing", ["plain", "antialiased"])
+def test_what_files_are_drawn_as_is_decided_once_for_a_run(drawing: str) -> None:
+    settings = run_settings.of_new_run({"drawing": drawing})
+    assert {settings[stage].drawing for stage in ("train", "quantise", "export")} == {drawing}
+
+
+def test_an_option_of_one_stage_goes_to_that_stage() -> None:
+    given = {"steps": 7, "seed": 3, "max_splats": 9}
+    assert options_of("train", given) == given
+    assert options_of("sfm", given) == {"steps": 7, "seed": 3}  # `steps` is no field of it
