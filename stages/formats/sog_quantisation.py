@@ -97,10 +97,9 @@ def splats_to_write(row: Format, quantised: QuantisedSplats) -> Splats:
         sh = quantised.flat_dc[:, None].astype(splats.sh.dtype)
         splats = replace(splats.with_sh_degree(0), sh=sh)
     splats = drop_undrawable(splats)[0]
-    bits = quantised.decisions.get("bits")
-    if not row.quantiser or not isinstance(bits, dict):
+    if not row.quantiser or quantised.sog_bits is None:
         return splats
-    found: Splats = resolve_name(row.quantiser)(splats, BitDepths(**bits))
+    found: Splats = resolve_name(row.quantiser)(splats, BitDepths(**quantised.sog_bits))
     return found
 
 

@@ -116,12 +116,11 @@ class FormatFinetuning:
         from that file, without and with fine-tuning). Raises Interrupted."""
         self.rounding.steps = 0  # so that a file does not depend on those before it
         plain = splats_to_write(row, quantised)
-        found = splats_to_write(row, replace(quantised, decisions={}))
+        found = splats_to_write(row, replace(quantised, sog_bits=None))
         written = rounded = partial(write_and_read, row)
-        bits = quantised.decisions.get("bits")
-        if row.quantiser and isinstance(bits, dict):
+        if row.quantiser and quantised.sog_bits is not None:
             found = smallest_rotations(found)
-            rounded = partial(quantise_splats, bits=BitDepths(**bits))
+            rounded = partial(quantise_splats, bits=BitDepths(**quantised.sog_bits))
         steps, backend = self.settings.rounding_steps, backend_of_settings(self.settings)
         found = finetune_to_rounding(rounded, found, self.rounding, steps, self.view_counts)
         plain_db, finetuned_db = (

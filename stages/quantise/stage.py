@@ -84,7 +84,7 @@ def run(
     )
     plain = finetuning.to_plain_drawing(kept)
     flat = _flat_colours(kept if plain is None else plain, reconstruction, settings)
-    quantised = QuantisedSplats(kept, {}, flat, plain=plain, drawing=settings.drawing)
+    quantised = QuantisedSplats(kept, None, flat, plain=plain, drawing=settings.drawing)
     bits, sog_db = None, None
     if _SOG in settings.formats:
         sog = splats_to_write(FORMATS[_SOG], quantised)
@@ -118,9 +118,9 @@ def run(
     report.metric("kept_mib", round(_bytes(kept) / 2**20, 3))
     report.metric("evaluated_side_px", splats.draw_settings.side)
     report_backend(report, backend_of_settings(settings))
-    quantised = replace(quantised, decisions=decisions)
+    quantised = replace(quantised, sog_bits=bits)
     quantised = replace(quantised, finetuned=finetuning.to_rounding(quantised))
-    _save(folder, quantised)
+    _save(folder, quantised, decisions)
     return quantised
 
 
@@ -218,11 +218,12 @@ class _Measure:
         return {psnr_name(size, stem): self.psnr(splats, scale) for size, scale in SIZES.items()}
 
 
-def _save(folder: Path, quantised: QuantisedSplats) -> None:
+def _save(folder: Path, quantised: QuantisedSplats, decisions: Mapping[str, object]) -> None:
+    """decisions: what people read of them, and "bits" and "drawing", which `load` reads."""
     shutil.rmtree(folder / _FINETUNED, ignore_errors=True)  # of an interrupted run
     save_splats(folder, quantised.splats)
-    decisions = json.dumps(quantised.decisions, indent=1) + "\n"
-    (folder / _DECISIONS).write_text(decisions, encoding="utf-8")
+    text = json.dumps(decisions, indent=1) + "\n"
+    (folder / _DECISIONS).write_text(text, encoding="utf-8")
     if quantised.flat_dc is not None:
         with replacing(folder / _FLAT) as path, path.open("wb") as file:
             np.save(file, quantised.flat_dc)
@@ -245,7 +246,7 @@ def load(folder: Path) -> QuantisedSplats:
         flat = np.load(folder / _FLAT) if (folder / _FLAT).exists() else None
         return QuantisedSplats(
             splats,
-            decisions,
+            decisions["bits"],
             flat,
             plain=finetuned.pop(PLAIN, None),
             finetuned=finetuned,

@@ -61,7 +61,7 @@ def run(scene: SmallScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> P
     files = tuple(ExportedFile(name, f"scene.{name}", 1) for name in names)
     outputs = {
         "sfm": scene.reconstruction,
-        "quantise": QuantisedSplats(scene.splats, {}),
+        "quantise": QuantisedSplats(scene.splats),
         "export": ExportedAssets(exported, files),
     }
 

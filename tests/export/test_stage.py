@@ -37,7 +37,7 @@ def exported(
     splats = replace(splats, origin=scene.reconstruction.origin)
     inputs = {
         "sfm": scene.reconstruction,
-        "quantise": QuantisedSplats(splats, {}),
+        "quantise": QuantisedSplats(splats),
     }
     return export.run(inputs, ExportSettings(**settings), folder, report), report
 

@@ -76,7 +76,7 @@ def covariances(splats: Splats) -> np.ndarray:
 
 def test_only_formats_that_compress_are_quantised() -> None:
     splats = many_splats(100)
-    quantised = QuantisedSplats(splats, {"bits": vars(FEW)})
+    quantised = QuantisedSplats(splats, vars(FEW))
     for name, row in FORMATS.items():
         held = splats_to_write(row, quantised)
         assert np.array_equal(held.means, splats.means) == (name != "sog"), name
@@ -86,7 +86,7 @@ def test_only_formats_that_compress_are_quantised() -> None:
 def test_without_view_dependence_colours_are_the_mean_of_what_photographs_see(name) -> None:
     splats = many_splats(50)
     flat = np.full((50, 3), 0.25, np.float32)
-    held = splats_to_write(FORMATS[name], QuantisedSplats(splats, {}, flat))
+    held = splats_to_write(FORMATS[name], QuantisedSplats(splats, None, flat))
     assert (held.sh[:, 0] == 0.25).all() == (name == "splat")
     same = replace(splats, sh=splats.sh[:, :1], sh_degrees=splats.sh_degrees * 0)
-    assert np.array_equal(splats_to_write(FORMATS[name], QuantisedSplats(same, {})).sh, same.sh)
+    assert np.array_equal(splats_to_write(FORMATS[name], QuantisedSplats(same)).sh, same.sh)

@@ -70,7 +70,7 @@ def test_what_is_read_comes_in_the_order_that_was_written(scene: SmallScene, nam
 
 
 def quantised(scene: SmallScene, *names: str) -> tuple[QuantisedSplats, dict[str, dict]]:
-    plain = QuantisedSplats(scene.splats, {"bits": vars(FEW)})
+    plain = QuantisedSplats(scene.splats, vars(FEW))
     settings = QuantiseSettings(rounding_steps=10, backend="cpu")
     finetuning = FormatFinetuning(
         *(finetuner(scene), finetuner(scene), views(scene), no_counts(scene), settings, Report())

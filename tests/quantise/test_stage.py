@@ -102,7 +102,7 @@ def test_the_same_inputs_give_the_same_bytes_and_load_gives_the_output(
     assert contents[0] == contents[1]
     loaded = quantise.load(folders[0])
     np.testing.assert_array_equal(loaded.splats.sh, result.splats.sh)
-    assert loaded.decisions == result.decisions
+    assert loaded.sog_bits == result.sog_bits is not None
     assert set(loaded.finetuned) == {"splat", "sog"}
     for name, splats in loaded.finetuned.items():
         np.testing.assert_array_equal(splats.means, result.finetuned[name].means)

@@ -103,7 +103,7 @@ def test_every_format_is_written_and_evaluated(tradeoff) -> None:
 @pytest.mark.slow
 def test_formats_are_written_with_the_precision_that_the_run_chose(inputs, tmp_path) -> None:
     bits = {"position": 11, "rotation": 4, "scale": 4, "colour": 4, "opacity": 4, "palette": 5}
-    decided = QuantisedSplats(inputs.splats, {"bits": bits})
+    decided = QuantisedSplats(inputs.splats, bits)
     found = [
         next(p for p in measure_tradeoff(m, lambda label: None).formats if p.label == ".sog")
         for m in (inputs, replace(inputs, quantised=decided))
