@@ -108,53 +108,77 @@ def measure_contributions(
         beyond: how far each picture is continued on all sides, in longer sides of the picture. What
             is drawn there counts as if it were right; `sse` and `psnr_db` are of the picture alone.
     """
-    n = len(splats)
-    change, picture, weight, kept_weight = np.zeros((4, n))
-    view_counts, sse, depths, psnr_db = np.zeros(n, np.int32), 0.0, [], []
-    if previous is not None:
-        change, picture = previous.sse_change.copy(), previous.picture_change.copy()
-        weight, view_counts = previous.weight.copy(), previous.view_counts.copy()
-        kept_weight = previous.kept_weight.copy()
-        sse, depths = previous.sse, previous.scene_depth.tolist()
     rasteriser, arrays = rasteriser_of(backend), splat_arrays(splats)
-    settings = raster_settings_of(splats)
+    settings, sums = raster_settings_of(splats), _Sums(len(splats), previous)
     sh = _ShTruncation(splats, truncation, previous.sh_sums if previous else ())
     for view in views:
         border = round(beyond * max(view.camera.width, view.camera.height))
         forward = rasteriser.forward(arrays, view.camera.continued(border), settings, depths=True)
+        residual = sums.add_picture(forward, view, border)
+        found = rasteriser.contributions(forward, residual)
+        kept_weight = _kept_weight(rasteriser, forward, view, border, found)
+        sums.add_splats(forward.visible, found, kept_weight)
+        sh.add(view.camera.centre, forward.visible, found)
+    truncated_sse_change, truncated_picture_change, truncated_colour = sh.figures()
+    return Contributions(
+        sse_change=sums.change,
+        picture_change=sums.picture,
+        weight=sums.weight,
+        kept_weight=sums.kept_weight,
+        view_counts=sums.view_counts,
+        sse=sums.sse,
+        scene_depth=np.array(sums.depths),
+        truncated_sse_change=truncated_sse_change,
+        truncated_picture_change=truncated_picture_change,
+        truncated_colour=truncated_colour,
+        psnr_db=np.array(sums.psnr_db),
+        sh_sums=sh.sums,
+        previous=previous,
+    )
+
+
+class _Sums:
+    """The fields of `Contributions` that are sums or lists over views."""
+
+    def __init__(self, n: int, previous: Contributions | None) -> None:
+        self.change, self.picture, self.weight, self.kept_weight = np.zeros((4, n))
+        self.view_counts, self.sse = np.zeros(n, np.int32), 0.0
+        self.depths: list[float] = []
+        self.psnr_db: list[float] = []
+        if previous is not None:
+            self.change, self.picture = previous.sse_change.copy(), previous.picture_change.copy()
+            self.weight, self.kept_weight = previous.weight.copy(), previous.kept_weight.copy()
+            self.view_counts, self.sse = previous.view_counts.copy(), previous.sse
+            self.depths = previous.scene_depth.tolist()
+
+    def add_picture(
+        self, forward: Forward, view: EvaluationView, border: int
+    ) -> NDArray[np.float32]:
+        """Add what a picture, continued by `border` pixels, says as a whole; its residual
+        [3, H, W], 0 outside the view."""
         drawn = _inside(forward.image[:3], border).transpose(1, 2, 0)
-        psnr_db.append(capped_psnr_db(drawn, view.image, view.valid))
+        self.psnr_db.append(capped_psnr_db(drawn, view.image, view.valid))
         residual = np.zeros_like(forward.image[:3])
         _inside(residual, border)[:] = (drawn - view.image).transpose(2, 0, 1)
         if view.valid is not None:
             _inside(residual, border)[:] *= view.valid
-        sse += float(np.sum(residual.astype(np.float64) ** 2))
+        self.sse += float(np.sum(residual.astype(np.float64) ** 2))
         solid = forward.image[4][forward.image[3] > 0.5]
-        depths.append(float(np.median(solid)) if solid.size else np.inf)
-        found = rasteriser.contributions(forward, residual)
-        rows = forward.visible
-        change[rows] += found[:, ERROR_CHANGE]
-        picture[rows] += found[:, PICTURE_CHANGE]
-        weight[rows] += found[:, WEIGHT]
-        kept_weight[rows] += _kept_weight(rasteriser, forward, view, border, found)
-        view_counts[rows] += found[:, LARGEST_WEIGHT] >= VISIBLE_WEIGHT
-        sh.add(view.camera.centre, rows, found)
-    truncated_sse_change, truncated_picture_change, truncated_colour = sh.figures()
-    return Contributions(
-        sse_change=change,
-        picture_change=picture,
-        weight=weight,
-        kept_weight=kept_weight,
-        view_counts=view_counts,
-        sse=sse,
-        scene_depth=np.array(depths),
-        truncated_sse_change=truncated_sse_change,
-        truncated_picture_change=truncated_picture_change,
-        truncated_colour=truncated_colour,
-        psnr_db=np.array(psnr_db),
-        sh_sums=sh.sums,
-        previous=previous,
-    )
+        self.depths.append(float(np.median(solid)) if solid.size else np.inf)
+        return residual
+
+    def add_splats(
+        self,
+        rows: NDArray[np.int32],
+        found: NDArray[np.float64],
+        kept_weight: NDArray[np.float64],
+    ) -> None:
+        """Add the rasteriser's contributions `found` [K, ...] of the splats `rows` [K]."""
+        self.change[rows] += found[:, ERROR_CHANGE]
+        self.picture[rows] += found[:, PICTURE_CHANGE]
+        self.weight[rows] += found[:, WEIGHT]
+        self.kept_weight[rows] += kept_weight
+        self.view_counts[rows] += found[:, LARGEST_WEIGHT] >= VISIBLE_WEIGHT
 
 
 def _inside(image: NDArray[np.float32], border: int) -> NDArray[np.float32]:

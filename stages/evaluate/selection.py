@@ -53,33 +53,11 @@ class Removal:
         return replace(splats, sh=sh, sh_degrees=self.degrees).take(~self.removed)
 
 
-def select_removal(
-    splats: Splats,
-    contributions: Contributions,
-    cameras: Sequence[Camera],
-    sse_per_parameter: float,
-    most: int,
-    share: float = ROUND_SHARE,
-    change: float = np.inf,
-    complete: bool = True,
-) -> Removal | None:
-    """The splats and SH coefficients that contribute less than `sse_per_parameter` for each of
-    their parameters, least first; None if there are none.
-
-    A contribution is measured by how much the pictures change. By how much their error changes,
-    neighbours that are each a little too much seem harmful one by one, and are missed together: a
-    capture lost 5 dB without the tenth that seemed to do most harm. Fine-tuning corrects what the
-    residual asks for in any case. The predicted change of the error is measured by the error.
-
-    Floaters, splats outside the region around the views, and those that lie within a picture and
-    are hidden in all of them are removed at any multiplier. Other splats that fewer than
-    `FEW_VIEWS` views see, or that lie just outside all pictures, are removed last, and only if
-    `sse_per_parameter` is infinite: the views say little about them.
+@dataclass(frozen=True)
+class RemovalLimits:
+    """What one round may remove.
 
     Args:
-        splats: N splats.
-        contributions: of them to the views.
-        cameras: of all training views, in the same order.
         sse_per_parameter: the Lagrange multiplier of the rate-distortion cost.
         most: splats to remove.
         share: of the splats; so many times `SH_FACTOR` may lose SH degrees.
@@ -89,29 +67,69 @@ def select_removal(
             need what these hardly see: only splats outside the region around all views are then
             removed at any multiplier.
     """
+
+    sse_per_parameter: float
+    most: int
+    share: float = ROUND_SHARE
+    change: float = np.inf
+    complete: bool = True
+
+
+def select_removal(
+    splats: Splats, contributions: Contributions, cameras: Sequence[Camera], limits: RemovalLimits
+) -> Removal | None:
+    """The splats and SH coefficients that contribute less than `limits.sse_per_parameter` for each
+    of their parameters, least first; None if there are none.
+
+    A contribution is measured by how much the pictures change. By how much their error changes,
+    neighbours that are each a little too much seem harmful one by one, and are missed together: a
+    capture lost 5 dB without the tenth that seemed to do most harm. Fine-tuning corrects what the
+    residual asks for in any case. The predicted change of the error is measured by the error.
+
+    Floaters, splats outside the region around the views, and those that lie within a picture and
+    are hidden in all of them are removed at any multiplier. Other splats that fewer than
+    `FEW_VIEWS` views see, or that lie just outside all pictures, are removed last, and only if
+    the multiplier is infinite: the views say little about them.
+
+    Args:
+        splats: N splats.
+        contributions: of them to the views.
+        cameras: of all training views, in the same order.
+        limits: of the round.
+    """
+    floaters, free, near = _free(splats, contributions, cameras, limits.complete)
+    ratio = contributions.picture_change / parameters_per_splat(splats.sh_degrees)
+    ratio[(contributions.view_counts < FEW_VIEWS) & near] = np.finfo(np.float64).max
+    ratio[free] = -np.inf
+    order = np.argsort(ratio, kind="stable")
+    allowed = free | _least_of_neighbours(splats, ratio)
+    chosen = order[(allowed & (ratio < limits.sse_per_parameter))[order]][: limits.most]
+    changes = np.where(free[chosen], 0.0, contributions.picture_change[chosen])
+    chosen = chosen[np.cumsum(changes) <= limits.change]
+    removed = np.zeros(len(splats), bool)
+    removed[chosen] = True
+    # SH coefficients that contribute more than the last removed splat stay
+    reached = 0 < len(chosen) == limits.most
+    limit = float(ratio[chosen[-1]]) if reached else limits.sse_per_parameter
+    degrees, colour, sh_sse = _select_sh(splats, contributions, removed, limit, limits.share)
+    if not len(chosen) and np.array_equal(degrees, splats.sh_degrees):
+        return None
+    predicted = float(contributions.sse_change[chosen].sum()) + sh_sse
+    return Removal(removed, degrees, colour, int(floaters[chosen].sum()), predicted)
+
+
+def _free(
+    splats: Splats, contributions: Contributions, cameras: Sequence[Camera], complete: bool
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+    """[N] each: floaters; splats that may go at any multiplier; splats in the region around the
+    views. complete: see `RemovalLimits`."""
     seen, near = contributions.view_counts > 0, near_view_frusta(splats, cameras)
     floaters, free = np.zeros(len(splats), bool), ~seen & ~near
     if complete:
         floaters = near_camera_floaters(splats, contributions, cameras)
         floaters |= splats_in_masks(contributions)
         free |= floaters | (~seen & near_view_frusta(splats, cameras, margin=0.0))
-    ratio = contributions.picture_change / parameters_per_splat(splats.sh_degrees)
-    ratio[(contributions.view_counts < FEW_VIEWS) & near] = np.finfo(np.float64).max
-    ratio[free] = -np.inf
-    order = np.argsort(ratio, kind="stable")
-    allowed = free | _least_of_neighbours(splats, ratio)
-    chosen = order[(allowed & (ratio < sse_per_parameter))[order]][:most]
-    changes = np.where(free[chosen], 0.0, contributions.picture_change[chosen])
-    chosen = chosen[np.cumsum(changes) <= change]
-    removed = np.zeros(len(splats), bool)
-    removed[chosen] = True
-    # SH coefficients that contribute more than the last removed splat stay
-    limit = float(ratio[chosen[-1]]) if 0 < len(chosen) == most else sse_per_parameter
-    degrees, colour, sh_sse = _select_sh(splats, contributions, removed, limit, share)
-    if not len(chosen) and np.array_equal(degrees, splats.sh_degrees):
-        return None
-    predicted = float(contributions.sse_change[chosen].sum()) + sh_sse
-    return Removal(removed, degrees, colour, int(floaters[chosen].sum()), predicted)
+    return floaters, free, near
 
 
 def _least_of_neighbours(splats: Splats, ratio: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -23,7 +23,7 @@ from stages.evaluate.contribution import (
 )
 from stages.evaluate.evaluation import EvaluationView, image_renderer
 from stages.evaluate.rate_distortion import RateDistortion, rate_distortion_of
-from stages.evaluate.selection import BEYOND, ROUND_SHARE, Removal, select_removal
+from stages.evaluate.selection import BEYOND, ROUND_SHARE, Removal, RemovalLimits, select_removal
 from stages.prune.targets import Psnr, Targets
 from stages.scene import Splats, evenly_spaced
 from stages.train.finetune import FineTuner
@@ -177,7 +177,7 @@ class Pruner:
     def _remove_unneeded(self, found: PruningResult, state: Contributions) -> Contributions:
         """Remove floaters, and splats that no view shows, whatever else may go."""
         most = len(found.splats) - 1
-        removal = select_removal(found.splats, state, self._cameras, 0.0, most, ROUND_SHARE)
+        removal = select_removal(found.splats, state, self._cameras, RemovalLimits(0.0, most))
         if removal is None:
             return state
         fewer = removal.apply(found.splats)
@@ -242,7 +242,8 @@ class Pruner:
         most = max(1, int((ROUND_SHARE if excess else share) * len(found.splats)))
         most = min(most, excess or most, len(found.splats) - 1)
         limit = math.inf if forced else limit
-        return select_removal(found.splats, state, self._cameras, limit, most, share)
+        limits = RemovalLimits(limit, most, share)
+        return select_removal(found.splats, state, self._cameras, limits)
 
 
 def _least_tenth_db(state: Contributions) -> float:

@@ -89,20 +89,7 @@ def run(
     if _SOG in settings.formats:
         sog = splats_to_write(FORMATS[_SOG], quantised)
         bits, sog_db = choose_bits(sog, decider.psnr, settings.sog_loss_db)
-    figures = {
-        "psnr_raw_db": evaluator.psnr(splats),
-        **evaluator.psnr_at_sizes(kept, "psnr_kept"),
-        "psnr_plain_db": None if plain is None else evaluator.psnr(plain),
-        "psnr_splat32_db": evaluator.psnr(
-            write_and_read(FORMATS["splat"], splats_to_write(FORMATS["splat"], quantised))
-        ),
-        "sh_degree": kept.sh_degree,
-        "splats_by_sh_degree": [
-            int((kept.sh_degrees == d).sum()) for d in range(kept.sh_degree + 1)
-        ],
-        "bits": bits,
-        "measured_on": evaluator.what,
-    }
+    figures = _figures(splats, quantised, bits, evaluator)
     decisions: dict[str, object] = {
         **figures,
         "psnr_sog_training_db": sog_db,
@@ -122,6 +109,25 @@ def run(
     quantised = replace(quantised, finetuned=finetuning.to_rounding(quantised))
     _save(folder, quantised, decisions)
     return quantised
+
+
+def _figures(
+    splats: Splats, quantised: QuantisedSplats, bits: dict[str, int] | None, evaluator: _Measure
+) -> dict[str, object]:
+    """The figures of the decision, for the report and for people. splats: before it."""
+    kept, plain, row = quantised.splats, quantised.plain, FORMATS["splat"]
+    return {
+        "psnr_raw_db": evaluator.psnr(splats),
+        **evaluator.psnr_at_sizes(kept, "psnr_kept"),
+        "psnr_plain_db": None if plain is None else evaluator.psnr(plain),
+        "psnr_splat32_db": evaluator.psnr(write_and_read(row, splats_to_write(row, quantised))),
+        "sh_degree": kept.sh_degree,
+        "splats_by_sh_degree": [
+            int((kept.sh_degrees == d).sum()) for d in range(kept.sh_degree + 1)
+        ],
+        "bits": bits,
+        "measured_on": evaluator.what,
+    }
 
 
 def _choose_sh_degrees(

@@ -37,13 +37,7 @@ def make_trainer(
         reconstruction.views, settings.train_side, light, settings.antialias, vignetting
     )
     held_out = load_evaluation_views(reconstruction.folder, held, draw_settings)
-    sides = [max(v.camera.width, v.camera.height) for v in reconstruction.views]
-    if smaller := sum(side < settings.train_side for side in sides):
-        report.warn(
-            "train-photographs-smaller",
-            f"Used at their own size, smaller than --train-side {settings.train_side}: "
-            f"{counted(smaller, 'photograph')}. --max-side sets how large ingest keeps them.",
-        )
+    _warn_of_small_photographs(reconstruction, settings.train_side, report)
     determined = splats_determined([view.levels[-1].camera for view in train], settings.sh_degree)
     cap = cap_for(folder, settings.max_splats, determined)
     report.metric("splat_cap_free_mib", cap.free_mib)
@@ -75,6 +69,18 @@ def make_trainer(
         seed=settings.seed,
     )
     return Trainer(task, schedule, cap, refinement)
+
+
+def _warn_of_small_photographs(
+    reconstruction: Reconstruction, train_side: int, report: Report
+) -> None:
+    sides = [max(view.camera.width, view.camera.height) for view in reconstruction.views]
+    if smaller := sum(side < train_side for side in sides):
+        report.warn(
+            "train-photographs-smaller",
+            f"Used at their own size, smaller than --train-side {train_side}: "
+            f"{counted(smaller, 'photograph')}. --max-side sets how large ingest keeps them.",
+        )
 
 
 def _limited_steps(settings: TrainSettings, views: int, report: Report) -> int:

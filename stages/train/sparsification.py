@@ -18,7 +18,7 @@ import numpy as np
 
 from stages.evaluate.contribution import MAX_MEASURED_VIEWS, measure_contributions
 from stages.evaluate.evaluation import EvaluationView
-from stages.evaluate.selection import select_removal
+from stages.evaluate.selection import RemovalLimits, select_removal
 from stages.raster.smoothing import smoothed
 from stages.scene import Camera, Splats, evenly_spaced
 from stages.train.conversion import splats_of, valid_rows
@@ -67,9 +67,8 @@ class Sparsification:
         change = contributions.sse * (10 ** (LOSS_DB / len(SHARES) / 10) - 1)
         most = int(LARGEST_ROUND * len(splats))
         every = len(rows) == len(task.views)
-        removal = select_removal(
-            *(splats, contributions, cameras, np.inf, most), change=change, complete=every
-        )
+        limits = RemovalLimits(np.inf, most, change=change, complete=every)
+        removal = select_removal(splats, contributions, cameras, limits)
         if removal is None:
             return model
         return model.take(~removal.removed | ~self.density.inside(model))

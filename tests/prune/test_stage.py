@@ -17,7 +17,7 @@ from stages.evaluate import contribution, evaluation
 from stages.evaluate.contribution import Contributions, near_view_frusta
 from stages.evaluate.evaluation import load_evaluation_views, mean_psnr_db
 from stages.evaluate.floaters import near_camera_floaters
-from stages.evaluate.selection import select_removal
+from stages.evaluate.selection import RemovalLimits, select_removal
 from stages.prune import rounds as pruning
 from stages.prune import stage as prune
 from stages.prune.settings import PruneSettings
@@ -355,10 +355,10 @@ def test_what_few_views_show_is_removed_last() -> None:
     seen_by, change = [1, 2, 3, 5, 2], [1e-6, 1e-5, 0.1, 0.2, 1e-6]
     scene = splats([[0.1 * i, 0.0, 3.0] for i in range(5)])
     contributions = contributions_of(seen_by, change)
-    removal = select_removal(scene, contributions, [camera()], 1.0, most=5)
+    removal = select_removal(scene, contributions, [camera()], RemovalLimits(1.0, 5))
     assert removal is not None
     assert not removal.removed[[0, 1, 4]].any()
     assert removal.removed[[2, 3]].any()
-    forced = select_removal(scene, contributions, [camera()], np.inf, most=5)
+    forced = select_removal(scene, contributions, [camera()], RemovalLimits(np.inf, 5))
     assert forced is not None
     assert forced.removed.sum() > removal.removed.sum()
