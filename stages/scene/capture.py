@@ -222,25 +222,37 @@ def scene_extent(views: tuple[View, ...]) -> float:
     """Extent of the scene as in the reference trainer, world units: 1.1 x the largest distance of a
     camera from the cameras' centre. Never 0.
 
-    The centre is the median and "largest" is the 95th percentile, so that one stray camera does not
-    decide. The percentile is one camera's own distance, not a mean of two that could include the
-    stray one.
+    The centre is their geometric median and "largest" is the 95th percentile, so that one stray
+    camera does not decide. The percentile is one camera's own distance, not a mean of two that
+    could include the stray one.
     """
     centres = np.array([view.camera.centre for view in views])
-    distances = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
+    distances = np.linalg.norm(centres - geometric_median(centres), axis=1)
     return max(1.1 * float(np.percentile(distances, 95, method="lower")), 1e-6)
 
 
+def geometric_median(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[3] the point with the smallest sum of distances to `points` [N, 3], nearly, by Weiszfeld's
+    iteration (1937). It turns with the world, which a median of each axis does not."""
+    middle = points.mean(axis=0)
+    for _ in range(50):
+        away = np.linalg.norm(points - middle, axis=1)
+        weights = 1.0 / np.maximum(away, 1e-9 * away.max(initial=1e-300))
+        middle = weights @ points / weights.sum()
+    return np.asarray(middle)
+
+
 def training_extent(reconstruction: Reconstruction) -> float:
-    """The extent that training scales learning rates and splat sizes by, world units.
+    """The unit of length in training, world units.
 
     The larger of `scene_extent` and the depth at which the median camera sees its median point:
     the cameras of a phone held almost still say little about the size of the scene before them.
+    Held-out views do not count.
     """
-    depths = []
-    for view in reconstruction.views:
+    depths, views = [], split_held_out(reconstruction.views)[0]
+    for view in views:
         pixels, z = view.camera.project(reconstruction.points)
         seen = z[(z > 0) & view.camera.shows(pixels)]
         if len(seen):
             depths.append(float(np.median(seen)))
-    return max(scene_extent(reconstruction.views), float(np.median(depths)) if depths else 0.0)
+    return max(scene_extent(views), float(np.median(depths)) if depths else 0.0)

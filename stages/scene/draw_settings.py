@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.scene.camera import Camera
-from stages.scene.capture import TRANSPARENT, View, scene_extent
+from stages.scene.capture import TRANSPARENT, View, scene_extent, split_held_out
 
 NEAR_SHARE = 0.01  # of the cameras' extent: photographs are not in focus nearer than that
 # Of the diagonal of `_densest_half`, if there are no cameras. With this share, runs on six captures
@@ -52,9 +52,10 @@ def draw_settings_of(
     antialias: bool = False,
     vignetting: bool = False,
 ) -> DrawSettings:
-    """How splats trained on these views are drawn. The others: as in `DrawSettings`."""
+    """How splats trained on these views are drawn, by the training views among them. The others: as
+    in `DrawSettings`."""
     cut_out = any(view.outside == TRANSPARENT for view in views)
-    near = NEAR_SHARE * scene_extent(views)
+    near = NEAR_SHARE * scene_extent(split_held_out(views)[0])
     return DrawSettings(near, side, float(cut_out), light, antialias, vignetting)
 
 

@@ -27,7 +27,7 @@ from stages.train.history import HistoryEntry
 from stages.train.optimiser import Model
 
 FILE_NAME = "checkpoint.bin"
-MAGIC = b"SPLATC13"
+MAGIC = b"SPLATC14"
 _PREVIOUS = "checkpoint-previous.bin"
 _TEMPORARY = FILE_NAME + ".tmp"
 _CHUNK_BYTES = 1 << 20

@@ -8,6 +8,7 @@ of columns that starts by itself has a number of steps: the opacity, and each SH
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -39,6 +40,8 @@ from stages.raster.kernels.simd import (
     vsqrt,
     vstore,
 )
+from stages.scene import Camera
+from stages.seed.neighbours import nearest_distance
 
 BETA1, BETA2 = 0.9, 0.999
 # Gradients are those of H x W x loss (see `loss`), so this is about 1e-9 in the units of the mean
@@ -53,6 +56,8 @@ LARGEST_GRADIENT = 1e12
 BASIC_STEPS, OPACITY_STEPS, SH_STEPS = 0, 1, 2
 STEP_COUNTS = SH_STEPS + 3
 CHUNK = 512
+# Extents of the scene: a splat beside a camera still moves as other cameras need it.
+LEAST_DISTANCE = 0.1
 _F = np.float32
 
 
@@ -180,11 +185,13 @@ def adam_step(
             degree do not change.
         counts: how many columns of steps are advanced, from the first.
         corrections: [T, 2] 1 / (1 - beta^t) of both betas.
-        rates: [columns of gradients] learning rates.
+        rates: [columns of gradients] learning rates; that of a mean is multiplied by its splat's
+            `Model.distances`.
         ndc_x, ndc_y: factors from a gradient per pixel to the units of the densification threshold.
     """
     means, quaternions, log_scales, opacity_logits, sh, sh_degrees = model[:6]
     moment1, moment2, steps, gradient_sum, gradient_count = model[6:11]
+    distances = model[12]
     n = len(visible)
     columns = gradients.shape[1]
     row_width, n_sh = moment1.shape[1], min(columns - SH, sh.shape[1])
@@ -203,6 +210,8 @@ def adam_step(
             _update_moments(
                 gradients, at, columns, moment1, moment2, own, rates, scales, counts, shift
             )
+            for k in range(MEAN, ROTATION):
+                shift[k] *= distances[i]
             used = 3 * (np.int64(sh_degrees[i]) + 1) ** 2
             _move(i, shift, means, quaternions, log_scales, opacity_logits, sh, min(n_sh, used))
             gx, gy = means2d[rank, 0] * ndc_x, means2d[rank, 1] * ndc_y
@@ -224,7 +233,8 @@ class Model:
     trained. moment1, moment2: columns as the gradient's, for all coefficients.
     steps [N, STEP_COUNTS] int32: numbers of steps, by groups of columns. gradient_sum,
     gradient_count [N]: since the last densification. smoothing [N]: widths of the 3D smoothing
-    filter, 0 for none.
+    filter, 0 for none. distances [N]: to the nearest camera, in extents of the scene: how far a
+    mean moves to move as far in a picture; see `camera_distances`.
     """
 
     means: NDArray[np.float32]
@@ -239,6 +249,7 @@ class Model:
     gradient_sum: NDArray[np.float32]
     gradient_count: NDArray[np.int32]
     smoothing: NDArray[np.float32]
+    distances: NDArray[np.float32]
 
     def __len__(self) -> int:
         return len(self.means)
@@ -294,6 +305,7 @@ def new_model(
         np.zeros(n, np.float32),
         np.zeros(n, np.int32),
         np.zeros(n, np.float32),
+        np.ones(n, np.float32),
     )
 
 
@@ -301,6 +313,19 @@ def empty_model() -> Model:
     """No splats at all."""
     shapes = ((0, 3), (0, 4), (0, 3), (0,), (0, 1, 3))
     return new_model(*(np.zeros(shape, np.float32) for shape in shapes))
+
+
+def camera_distances(
+    means: NDArray[np.float32], cameras: Sequence[Camera], extent: float
+) -> NDArray[np.float32]:
+    """[N] distance of each of the means [N, 3] to the nearest camera, in extents of the scene, at
+    least LEAST_DISTANCE; 1 for means that are not finite, and without cameras."""
+    found = np.ones(len(means))
+    finite = np.isfinite(means).all(1)
+    if cameras and finite.any():
+        centres = np.array([camera.centre for camera in cameras])
+        found[finite] = nearest_distance(means[finite].astype(np.float64), centres) / extent
+    return np.maximum(found, LEAST_DISTANCE).astype(np.float32)
 
 
 _CORRECTIONS = bias_corrections()

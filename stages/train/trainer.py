@@ -33,7 +33,7 @@ from stages.train.clock import Clock
 from stages.train.conversion import initial_model
 from stages.train.dropout import Dropout, uses_dropout
 from stages.train.history import History
-from stages.train.optimiser import LearningRates, Model
+from stages.train.optimiser import LearningRates, Model, camera_distances
 from stages.train.schedule import Schedule
 from stages.train.steps.memory_limited import MemoryLimitedStep
 from stages.train.steps.step import StepInput, TrainingStep, step_of
@@ -122,6 +122,7 @@ class Trainer:
         saved, step = load_checkpoint(self.task.folder, report.warn), 0
         if saved is None:
             model = initial_model(start, self.schedule.sh_degree, self.cap.splats)
+            model.distances[:] = self.camera_distances(model.means)
         else:
             model, state = most_opaque(saved[0], self.cap.splats), saved[1]
             step, self.provenance = state.step, state.provenance
@@ -194,7 +195,9 @@ class Trainer:
         return self.stepper.model()
 
     def replace_model(self, model: Model) -> None:
-        """Go on with `model`, under new widths of the smoothing filter if it is used."""
+        """Go on with `model`: at its distances from the cameras, and under new widths of the
+        smoothing filter if it is used."""
+        model.distances[:] = self.camera_distances(model.means)
         if self.task.smooth:
             model.smoothing[:] = self.smoothing_widths(model.means)
         self.stepper.load(model)
@@ -202,6 +205,10 @@ class Trainer:
     def replan(self, step: int, steps: int) -> None:
         """Make `steps` steps in all, `step` of which are done."""
         self.schedule = self.schedule.replanned(step, steps)
+
+    def camera_distances(self, means: NDArray[np.float32]) -> NDArray[np.float32]:
+        """[N] of positions [N, 3]: see `optimiser.camera_distances`."""
+        return camera_distances(means, self.cameras, self.schedule.extent)
 
     def smoothing_widths(self, means: NDArray[np.floating]) -> NDArray[np.float32]:
         """[N] of the smoothing filter at positions [N, 3], from all training views at full size."""

@@ -1,11 +1,20 @@
 """How large a scene is."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from stages.scene import Camera, Reconstruction, View, scene_extent, training_extent
+from stages.scene import (
+    Camera,
+    Reconstruction,
+    View,
+    draw_settings_of,
+    scene_extent,
+    training_extent,
+)
 
 
 def held_still(apart, points):
@@ -30,12 +39,42 @@ def test_cameras_close_together_see_as_large_a_scene_as_it_is_far_away(apart):
     assert training_extent(held_still(apart, wall(7.0))) == pytest.approx(7.0)
 
 
+def test_the_extent_turns_with_the_world():
+    """Cameras spread unevenly, so that the median of each axis depends on the axes."""
+    r = np.random.default_rng(2)
+    centres = r.gamma(0.5, size=(40, 3)) * [4.0, 1.0, 2.0]
+    wanted = scene_extent(standing_at(centres))
+    for seed in range(5):
+        turn = Rotation.random(random_state=seed).as_matrix()
+        assert scene_extent(standing_at(centres @ turn.T)) == pytest.approx(wanted, rel=1e-6)
+
+
+def test_held_out_cameras_do_not_change_the_unit_of_training():
+    made = held_still(0.5, wall(3.0))
+    near, elsewhere = made.views[0].camera, np.eye(4)
+    elsewhere[0, 3] = 500.0
+    far = replace(made.views[0], role="test", camera=replace(near, world_to_camera=elsewhere))
+    known = replace(made, views=tuple(replace(view, role="train") for view in made.views))
+    with_test = replace(known, views=(*known.views, far))
+    assert training_extent(with_test) == training_extent(known)
+    assert draw_settings_of(with_test.views).near == draw_settings_of(known.views).near
+
+
+def standing_at(centres):
+    views = []
+    for k, centre in enumerate(centres):
+        pose = np.eye(4)
+        pose[:3, 3] = -centre
+        views.append(View(f"{k}", f"{k}.jpg", Camera(64, 48, 50.0, 50.0, 32.0, 24.0, pose)))
+    return tuple(views)
+
+
 def test_a_walk_longer_than_what_it_sees_is_its_own_measure():
     walked = held_still(10.0, wall(2.0))
-    assert training_extent(walked) == scene_extent(walked.views) > 10
+    assert training_extent(walked) == scene_extent(walked.views[1:]) > 10
 
 
 @pytest.mark.parametrize("points", [np.zeros((0, 3)), -wall(3.0)])
 def test_without_points_in_any_picture_the_cameras_tell(points):
     bare = held_still(0.5, points)
-    assert training_extent(bare) == scene_extent(bare.views)
+    assert training_extent(bare) == scene_extent(bare.views[1:])

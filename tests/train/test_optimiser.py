@@ -1,5 +1,6 @@
 """Adam on the splats that a step has seen."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -8,14 +9,18 @@ import torch
 
 from stages.raster.definition import MEAN, ROTATION, Backward, gradient_columns, used_columns
 from stages.raster.kernels.pool import Pool
+from stages.scene import look_at
 from stages.train.optimiser import (
     EPSILON,
+    LEAST_DISTANCE,
     LearningRates,
     apply_gradients,
     bias_corrections,
+    camera_distances,
     new_model,
 )
 from stages.train.steps.reference import adam
+from tests.scenes import camera
 
 RATES = LearningRates(means=0.01)
 
@@ -71,6 +76,38 @@ def test_the_first_step_of_a_splat_first_seen_late_is_its_rate():
     before = m.means[1].copy()
     apply(m, backward([1], 4, seed=7, scale=100.0))  # far above EPSILON
     np.testing.assert_allclose(np.abs(m.means[1] - before), RATES.means, rtol=0.01)
+
+
+def test_a_mean_moves_in_proportion_to_its_distance_from_the_nearest_camera():
+    """So that it moves as far in that camera's picture, wherever it is."""
+    m = model(3)
+    m.distances[:] = 0.5, 1.0, 20.0
+    before = {name: array.copy() for name, array in vars(m).items()}
+    apply(m, backward([0, 1, 2], 4, scale=100.0))
+    moved = np.abs(m.means - before["means"])
+    np.testing.assert_allclose(moved, RATES.means * m.distances[:, None] * np.ones(3), rtol=0.01)
+    turned = np.abs(m.quaternions - before["quaternions"])
+    np.testing.assert_allclose(turned, RATES.quaternions, rtol=0.01)
+
+
+def test_distances_are_to_the_nearest_camera_in_extents_of_the_scene():
+    ahead = np.array([0, 0, 1.0])
+    cameras = [camera(4, 4, matrix=look_at(at, at + ahead)) for at in np.diag([0.0, 6.0, 0.0])]
+    means = np.array([[0, 0, 5], [0, 6, 0.01], [0, 3, 400], [np.nan, 0, 0]], np.float32)
+    found = camera_distances(means, cameras, extent=2.0)
+    np.testing.assert_allclose(found, [2.5, LEAST_DISTANCE, 200.0056, 1.0], rtol=1e-5)
+    in_millimetres = [
+        replace(one, world_to_camera=scaled_pose(one.world_to_camera, 1000)) for one in cameras
+    ]
+    same = camera_distances(1000 * means, in_millimetres, extent=2000.0)
+    np.testing.assert_allclose(same, found, rtol=1e-5)
+    assert (camera_distances(means, [], extent=2.0) == 1).all()
+
+
+def scaled_pose(pose, by):
+    moved = pose.copy()
+    moved[:3, 3] *= by
+    return moved
 
 
 def test_splats_out_of_view_and_broken_gradients_change_nothing():

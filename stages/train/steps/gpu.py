@@ -171,6 +171,7 @@ class GpuStep:
     def _load(self, model: Model) -> None:
         self._scene = self.rasteriser.scene(model.arrays)
         self._smoothing = self._on_device(model.smoothing)
+        self._distances = self._on_device(model.distances)
         self._sh_degrees, self._own = model.sh_degrees, self._own_columns(model)
         self._moment1, self._moment2 = map(self._on_device, (model.moment1, model.moment2))
         self._steps = self._on_device(model.steps)
@@ -197,8 +198,9 @@ class GpuStep:
             sh = rows[:, SH : SH + 3 * coefficients].reshape(len(rows), coefficients, 3)
             own = (means, quaternions, log_scales, rows[:, OPACITY], sh, self._sh_degrees)
             remembered = (self._moment1, self._moment2, self._steps)
-            counted = (self._gradient_sum, self._gradient_count, self._smoothing)
-            arrays = *map(np.ascontiguousarray, own), *map(_host, (*remembered, *counted))
+            counted = (self._gradient_sum, self._gradient_count)
+            given = (self._smoothing, self._distances)
+            arrays = *map(np.ascontiguousarray, own), *map(_host, (*remembered, *counted, *given))
             self._on_host = Model(*arrays)
         return self._on_host
 
@@ -277,7 +279,8 @@ class GpuStep:
         pixels = view.width * view.height
         gpu_kernels.adam_kernel[(triton.cdiv(n, block),)](
             *(self._scene.rows, self._moment1, self._moment2, self._steps, parameters, means2d),
-            *(drawn.keys, self._gradient_sum, self._gradient_count, self._corrections),
+            *(drawn.keys, self._gradient_sum, self._gradient_count, self._distances),
+            self._corrections,
             *(drawn.lists.total, room, n, rates.means, rates.quaternions, rates.log_scales),
             *(rates.opacity_logits, rates.sh_dc, rates.sh_rest),
             *(0.5 * view.width / pixels, 0.5 * view.height / pixels),

@@ -160,6 +160,7 @@ def adam_kernel(
     keys,
     gradient_sum,
     gradient_count,
+    distances,
     corrections,
     total,
     room,
@@ -207,8 +208,10 @@ def adam_kernel(
     m = m * tl.load(corrections + 2 * t, mask=there, other=0.0)
     v = v * tl.load(corrections + 2 * t + 1, mask=there, other=0.0)
     rate = rate_of(k, rate_means, rate_rotation, rate_scale, rate_opacity, rate_dc, rate_rest)
+    distance = tl.load(distances + i, mask=moved, other=1.0)
+    rate = tl.where((k < ROTATION)[None, :], rate[None, :] * distance[:, None], rate[None, :])
     value = tl.load(rows + at, mask=there, other=0.0)
-    tl.store(rows + at, value - rate[None, :] * m / (tl.sqrt(v) + EPSILON), mask=there)
+    tl.store(rows + at, value - rate * m / (tl.sqrt(v) + EPSILON), mask=there)
     accumulate(means2d, gradient_sum, gradient_count, i, moved, ndc_x, ndc_y)
 
 

@@ -123,7 +123,7 @@ def adam(
     v = BETA2 * model.moment2[rows, :columns] + (1 - BETA2) * g * g
     model.moment1[rows, :columns], model.moment2[rows, :columns] = m, v
     shift = rates.row(coefficients) * (m / (1 - BETA1**t)) / (np.sqrt(v / (1 - BETA2**t)) + EPSILON)
-    model.means[rows] -= shift[:, MEAN:ROTATION]
+    model.means[rows] -= shift[:, MEAN:ROTATION] * model.distances[rows, None]
     model.quaternions[rows] -= shift[:, ROTATION:LOG_SCALE]
     model.log_scales[rows] -= shift[:, LOG_SCALE:OPACITY]
     model.opacity_logits[rows] -= shift[:, OPACITY]

@@ -44,7 +44,9 @@ def masked(outside: str, light: tuple[float, float, float] | None) -> Level:
 
 
 def start(n=20) -> Model:
-    return new_model(*(a.copy() for a in splat_arrays(cloud(n, 40, 30, degree=1, seed=4))))
+    found = new_model(*(a.copy() for a in splat_arrays(cloud(n, 40, 30, degree=1, seed=4))))
+    found.distances[:] = np.linspace(0.1, 5.0, n)
+    return found
 
 
 def stepper(lag: int | None = None) -> GpuStep:

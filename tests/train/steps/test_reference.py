@@ -52,7 +52,9 @@ def stepped(
     level = replace(level, light=light)
     start = cloud(60, 40, 30, degree=1, seed=4)
     stepper = step_of(backend)
-    stepper.load(new_model(*(array.copy() for array in splat_arrays(start))))
+    model = new_model(*(array.copy() for array in splat_arrays(start)))
+    model.distances[:] = np.linspace(0.1, 5.0, len(start))
+    stepper.load(model)
     settings = RasterSettings(near=0.1, sh_degree=degree, background=(0.9, 0.2, 0.6))
     given = StepInput(level, settings, RATES, weight=weight)
     losses = [stepper.step(given) for _ in range(steps)]
