@@ -20,7 +20,8 @@ import numpy as np
 
 from stages.cameras.nerfstudio import OPENGL_FROM_OURS
 
-PICTURES = ("images", "masks")  # folders of which a part may be taken
+PICTURES = ("images", "masks")
+_SUFFIXES = (".jpg", ".jpeg", ".png")
 _STRECHA = "Benchmarking_Camera_Calibration_2008"
 _TRUE_CAMERAS = "gt_dense_cameras"
 
@@ -34,7 +35,8 @@ class Source:
         folder: of the capture there.
         parts: files and folders of it that are copied. A pattern such as *.JPG stands for all
             files so named, which are copied into `images`.
-        every: of the pictures, in the order of their names, the first and each so many-th after it.
+        every: of the pictures of a folder, in the order of their names, the first and each so
+            many-th after it.
         commit: where the newest one does not have it.
     """
 
@@ -77,7 +79,30 @@ SOURCES = {
     "bonsai": Source("EricXu23/Bonsaidownload", "", ("*.JPG",)),
     "table": Source("Scodive/Data", ""),
     "statue-of-liberty": Source("vork/StatueOfLiberty-Photogrammetry", "", PICTURES, every=3),
+    # walks with a background: an object in a room, a room, buildings, a statue, a flight
+    "kumamon": Source("ConsideringName/upload-files", ""),
+    "plant": Source("lvllvl/NeRF", "data/raw", ("*.jpeg",), every=2),
+    "lockers": Source("mamechun/gs_data", "", ("input",)),
+    "south-building": Source("sbradley374/gaussian-splat-test", ""),
+    "castle-P19": Source(
+        "openMVG/SfM_quality_evaluation", f"{_STRECHA}/castle-P19", ("images", _TRUE_CAMERAS)
+    ),
+    "stitch": Source("jianzhengjie/Gaussian-Splatting-", "data/sparse/0"),
+    "figure": Source("5697526/NeRF-TensoRF", ""),
+    "copier": Source("rage147-OwO/instant-ngp", "aaa", every=2),
+    "gum": Source("akristoffersen/Scene2Mesh", "real_scene_data/gum", ("train/*",), every=6),
+    "alexander": Source("vork/alexanderTheGreat", ""),
+    "office": Source("antoniocarevic/diplomski123", ""),
+    "corridor": Source("PavanGavit/test", "", ("frames/*",), every=2),
+    "tractor": Source(
+        "Uddhav786/Enhancing-3D-Scene-Reconstruction-with-NeRF-and-NVIDIA-s-Instant-NGP", ""
+    ),
+    "city": Source("Zeus-Xu/NeRF-3DGS", ""),
 }
+# These took no part in any choice. They are run once for a table, and reported as they come out.
+RUN_ONCE = (
+    *("stitch", "figure", "copier", "gum", "alexander", "office", "corridor", "tractor", "city"),
+)
 
 
 def photographs_of(capture: Path) -> Path:
@@ -104,13 +129,14 @@ def copy_from(clone: Path, source: Source, into: Path) -> None:
 
 def chosen(files: Iterable[tarfile.TarInfo], every: int) -> list[tarfile.TarInfo]:
     """All files but pictures that are left out."""
-    by_folder: dict[str, list[tarfile.TarInfo]] = {}
+    groups: dict[tuple[str, bool], list[tarfile.TarInfo]] = {}
     for file in sorted(files, key=lambda file: file.name):
-        by_folder.setdefault(file.name.rpartition("/")[0], []).append(file)
+        is_picture = Path(file.name).suffix.lower() in _SUFFIXES
+        groups.setdefault((file.name.rpartition("/")[0], is_picture), []).append(file)
     return [
         file
-        for folder, inside in by_folder.items()
-        for file in inside[:: every if folder in PICTURES else 1]
+        for (_, pictures), inside in groups.items()
+        for file in inside[:: every if pictures else 1]
     ]
 
 
