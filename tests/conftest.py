@@ -34,9 +34,11 @@ os.environ.setdefault("SPLAT_THREADS", "2")
 # Where there is no GPU its kernels are interpreted.
 if not any(Path(device).exists() for device in ("/dev/nvidia0", "/dev/kfd")):
     os.environ.setdefault("TRITON_INTERPRET", "1")
-# A job in the background is born deaf to Ctrl-C, and so would be all that it starts.
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+# A job in the background ignores Ctrl-C, and one under nohup the end of its terminal; so would all
+# that it starts.
+for _name, _usual in (("SIGINT", signal.default_int_handler), ("SIGHUP", signal.SIG_DFL)):
+    if hasattr(signal, _name) and signal.getsignal(getattr(signal, _name)) is signal.SIG_IGN:
+        signal.signal(getattr(signal, _name), _usual)
 
 
 def pytest_configure(config: pytest.Config) -> None:
