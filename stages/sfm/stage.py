@@ -22,7 +22,7 @@ from stages.scene import Capture, Reconstruction
 from stages.sfm import finish, light, reconstruction_files
 from stages.sfm.checks import acceptance, attempt_runner, fallbacks
 from stages.sfm.checks.gates import MOVE
-from stages.sfm.known import known_cameras
+from stages.sfm.known.reconstruct import reconstruct
 from stages.sfm.learned.weights import INSTALL, installed
 from stages.sfm.place import metric_scale
 from stages.sfm.place.crs import projected_system
@@ -126,7 +126,7 @@ def _from_known_cameras(
 ) -> tuple[Reconstruction, dict[str, float]]:
     """(the reconstruction, no seconds)."""
     deadline = time.monotonic() + 60.0 * settings.max_minutes
-    found = known_cameras.reconstruct(
+    found = reconstruct(
         capture,
         cameras,
         folder,

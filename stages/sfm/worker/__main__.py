@@ -18,7 +18,7 @@ def main(arguments: list[str]) -> int:
     die_with_parent()
     job = Job.read(Path(arguments[0]))
     # COLMAP loads once the process ends with its parent.
-    from stages.sfm.known import worker as known_cameras_worker
+    from stages.sfm.known import triangulation
     from stages.sfm.worker import features, mapping, matching
 
     steps = {
@@ -26,8 +26,8 @@ def main(arguments: list[str]) -> int:
         "matching": matching.match_all,
         "mapping": mapping.map_photographs,
         # with known cameras
-        "neighbours": known_cameras_worker.match_neighbours,
-        "triangulation": known_cameras_worker.triangulate,
+        "neighbours": triangulation.match_neighbours,
+        "triangulation": triangulation.triangulate,
         # with an executor
         "pair selection": matching.select_pairs,
         "features chunk": features.extract_chunk,
@@ -39,9 +39,9 @@ def main(arguments: list[str]) -> int:
 
 
 def _match_learned(job: Job) -> None:
-    from stages.sfm.learned import joining as learned  # imports torch, which takes seconds
+    from stages.sfm.learned import joining  # imports torch, which takes seconds
 
-    learned.match_learned(job)
+    joining.match_learned(job)
 
 
 if __name__ == "__main__":

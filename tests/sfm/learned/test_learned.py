@@ -16,14 +16,14 @@ from stages.ingest import stage as ingest
 from stages.ingest.settings import IngestSettings
 from stages.sfm import stage as sfm
 from stages.sfm.checks import acceptance
-from stages.sfm.learned import weights as learned_weights
+from stages.sfm.learned import weights
 from stages.sfm.settings import SfmSettings
 from stages.sfm.worker.pairs import joining_pairs, without_weaker
 from tests.sfm.checks import bad_captures
 from tests.sfm.truth import TRUTH, centres, similarity
 
 needs_weights = pytest.mark.skipif(
-    not learned_weights.installed(), reason=f"no learned features: {learned_weights.INSTALL}"
+    not weights.installed(), reason=f"no learned features: {weights.INSTALL}"
 )
 GAPS = 3  # every third photograph of the sample: 30 degrees from one to the next
 LARGEST_ERROR_M = 0.02  # of cameras 1.4 m from the scene; a wrong join is off by decimetres
@@ -34,7 +34,7 @@ def photograph() -> np.ndarray:
 
 
 def without_weights(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(learned_weights, "_PACKAGE", "no_such_package_anywhere")
+    monkeypatch.setattr(weights, "_PACKAGE", "no_such_package_anywhere")
 
 
 def test_a_photograph_is_paired_with_those_that_look_like_it_and_they_with_their_neighbours() -> (

@@ -6,7 +6,7 @@ import numpy as np
 
 from stages.ingest.faces import face_rotation
 from stages.scene.camera import look_at
-from stages.sfm.known.known_cameras import EXHAUSTIVE_UP_TO, neighbours
+from stages.sfm.known.reconstruct import EXHAUSTIVE_UP_TO, neighbours
 
 FACES = [face_rotation(*at) for at in ((0, 0), (90, 0), (270, 0), (0, 90), (0, -90))]
 
