@@ -28,6 +28,7 @@ from stages.sfm.checks.gates import (
     check_pairs,
     connected_groups,
 )
+from stages.sfm.checks.statistics import model_statistics
 from stages.sfm.worker import database as sqlite
 from stages.sfm.worker.chunks import (
     ChunkExecutor,
@@ -36,7 +37,7 @@ from stages.sfm.worker.chunks import (
 )
 from stages.sfm.worker.job import Job
 from stages.sfm.worker.process import WorkerCrashed, WorkerTimedOut, run_step
-from stages.sfm.worker.sparse_model import load_result, model_statistics, without_implausible_views
+from stages.sfm.worker.sparse_model import load_result, without_implausible_views
 
 MORE_FEATURES = 2.0  # factor on the number of features
 LOWER_PEAK = 0.4  # factor on SIFT's peak threshold

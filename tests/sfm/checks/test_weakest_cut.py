@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.sfm.worker.sparse_model import weakest_cut
+from stages.sfm.checks.statistics import weakest_cut
 
 Seen = tuple[NDArray[np.int64], NDArray[np.int64]]
 

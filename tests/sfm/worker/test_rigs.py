@@ -17,14 +17,11 @@ from stages.ingest.settings import IngestSettings
 from stages.scene import Capture, Face, Photo
 from stages.scene.rotations import matrices_of, quaternions_of
 from stages.sfm import stage as sfm
+from stages.sfm.checks.statistics import model_statistics
 from stages.sfm.settings import SfmSettings
 from stages.sfm.worker import pairs
 from stages.sfm.worker.job import job_of
-from stages.sfm.worker.sparse_model import (
-    MappingResult,
-    model_statistics,
-    without_implausible_views,
-)
+from stages.sfm.worker.sparse_model import MappingResult, without_implausible_views
 from tests.benchmarks import panoramas
 from tests.sfm.synthetic import orbit_model
 

@@ -8,16 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from stages.sfm.checks.statistics import (
+    flatness,
+    model_statistics,
+    sideways_share,
+    triangulation_angles,
+)
 from stages.sfm.worker.sparse_model import (
     MappingResult,
     SparseModel,
-    flatness,
     load_result,
-    model_statistics,
     reprojection_errors,
     save_model,
-    sideways_share,
-    triangulation_angles,
     without_implausible_views,
 )
 from tests.sfm.synthetic import orbit_model
