@@ -94,13 +94,12 @@ def write_reconstruction(
     *,
     levelled: bool,
     metric: MetricScale | None,
-    roles: Sequence[str] = (),
 ) -> Reconstruction:
     """Write the COLMAP model of the undistorted pictures, and return the reconstruction.
 
     Args:
         folder: of the reconstruction.
-        photos, cameras, roles: [V]; roles is empty if no photograph has one.
+        photos, cameras: [V].
         cloud: the points.
         observations: of these points.
         levelled: whether up is -Y.
@@ -114,13 +113,12 @@ def write_reconstruction(
             f"{IMAGES}/{photo.picture}",
             camera,
             photo.duplicate_of,
-            role,
-            mask_file(photo),
-            photo.outside,
+            mask=mask_file(photo),
+            outside=photo.outside,
             frame=photo.face.frame if photo.face else "",
             depth=depth_file(photo),
         )
-        for photo, camera, role in zip(photos, cameras, roles or [""] * len(photos), strict=True)
+        for photo, camera in zip(photos, cameras, strict=True)
     )
     return Reconstruction(
         folder=folder,

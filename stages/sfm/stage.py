@@ -30,7 +30,7 @@ from stages.sfm.place.metric_scale import KnownScale
 from stages.sfm.reconstruction_files import load_reconstruction
 from stages.sfm.settings import SfmSettings
 from stages.sfm.worker.chunks import ChunkExecutor
-from stages.sfm.worker.job import job_of, prepare_work_folder
+from stages.sfm.worker.job import Sift, prepare_work_folder, project_of
 
 _FEWEST_PHOTOGRAPHS = 3
 _FINISHED = "sfm.json"
@@ -93,12 +93,13 @@ def _from_photographs(
     _check_duplicates(capture)
     features = usable_features(settings.features, report)
     work = folder / _WORK
-    job = job_of(capture, work, settings.seed, settings.max_features, settings.matching)
-    prepare_work_folder(work, job)
+    project, sift = project_of(capture, work, settings.seed), Sift(settings.max_features)
+    prepare_work_folder(work, project, sift, settings.matching)
     runner = attempt_runner.AttemptRunner(
-        folder=work,
-        base=job,
-        report=report,
+        project,
+        sift,
+        settings.matching,
+        report,
         deadline=time.monotonic() + 60.0 * settings.max_minutes,
         allow_partial=settings.allow_partial,
         join_all=features == "learned",
@@ -112,7 +113,7 @@ def _from_photographs(
     report.metric("attempts", [acceptance.attempt_metrics(attempt) for attempt in attempts])
     model = acceptance.accepted_model(attempts, capture, settings.allow_partial, settings.features)
     acceptance.report_warnings(attempts, model, capture, report, settings.features)
-    known_scale = metric_scale.KnownScale(settings.scale, settings.marker, settings.crs)
+    known_scale = KnownScale(settings.scale, settings.marker, settings.crs)
     found = finish.finish(model, capture, folder, report, known_scale)
     best = fallbacks.best_attempt(attempts)
     _report_model(found, best.statistics.mean_reprojection_error_px, capture, report)
@@ -125,21 +126,7 @@ def _from_known_cameras(
     capture: Capture, settings: SfmSettings, cameras: Path, folder: Path, report: Report
 ) -> tuple[Reconstruction, dict[str, float]]:
     """(the reconstruction, no seconds)."""
-    deadline = time.monotonic() + 60.0 * settings.max_minutes
-    found = reconstruct(
-        capture,
-        cameras,
-        folder,
-        folder / _WORK,
-        report,
-        split=settings.split,
-        refine=settings.refine_cameras,
-        allow_partial=settings.allow_partial,
-        seed=settings.seed,
-        max_features=settings.max_features,
-        known_scale=KnownScale(settings.scale, settings.marker, settings.crs, settings.metres),
-        seconds_left=lambda: deadline - time.monotonic(),
-    )
+    found = reconstruct(capture, cameras, settings, folder, folder / _WORK, report)
     _report_model(found, float(found.errors_px.mean()), capture, report)
     report.metric("configuration", "known cameras")
     return found, {}

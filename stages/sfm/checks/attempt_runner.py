@@ -1,4 +1,4 @@
-"""Runs configurations of structure from motion: databases, worker jobs and what is kept to resume.
+"""Runs configurations of structure from motion: databases, worker jobs, and what is kept to resume.
 
 Everything lies under one work folder. A finished step leaves a marker file, and a run that was
 killed continues after the last marker. Unfinished extraction and matching continue inside COLMAP's
@@ -35,7 +35,16 @@ from stages.sfm.worker.chunks import (
     extract_features_in_chunks,
     match_pairs_in_chunks,
 )
-from stages.sfm.worker.job import Job
+from stages.sfm.worker.job import (
+    Features,
+    Job,
+    Learned,
+    Mapping,
+    Matching,
+    PairSelection,
+    Project,
+    Sift,
+)
 from stages.sfm.worker.process import WorkerCrashed, WorkerTimedOut, run_step
 from stages.sfm.worker.sparse_model import load_result, without_implausible_views
 
@@ -48,8 +57,9 @@ class AttemptRunner:
     """Runs configurations for one capture.
 
     Args:
-        folder: the work folder.
-        base: the job of the standard configuration, which the others vary.
+        project: of the standard configuration, in the work folder.
+        sift: settings of the standard configuration, which others vary.
+        matching: the setting, which others override.
         report: receives progress, and says when to stop.
         deadline: of all configurations together, in seconds of `time.monotonic`.
         allow_partial: go on to mapping although the gates before it failed.
@@ -58,8 +68,9 @@ class AttemptRunner:
         seconds: wall-clock seconds of each step so far, over all configurations.
     """
 
-    folder: Path
-    base: Job
+    project: Project
+    sift: Sift
+    matching: str
     report: Report
     deadline: float
     allow_partial: bool = False
@@ -78,18 +89,17 @@ class AttemptRunner:
 
         Raises SplatError for crashes of extraction and matching, and Interrupted.
         """
-        frames = self.base.frames
+        frames = self.project.photographs.frames
         photographs = int(frames.max()) + 1
         empty = ModelStatistics(photographs=photographs)
-        job = self._job(configuration)
         try:
-            self._extract_features(job)
+            project = self._with_features(configuration)
             if configuration.learned:
                 try:
-                    job = self._match_learned(self._match(job, configuration))
+                    project = self._with_learned(self._with_matches(project, configuration))
                 except WorkerCrashed as crash:  # SIFT's model may do
                     return Attempt(configuration, (crash,), empty)
-            found = sqlite.keypoint_counts(Path(job.database), len(frames))
+            found = sqlite.keypoint_counts(project.database, len(frames))
             counts = np.bincount(frames, found).astype(int).tolist()
             attempt = Attempt(configuration, (), empty, keypoints_median=float(median(counts)))
             failures = check_keypoints(counts)
@@ -97,11 +107,11 @@ class AttemptRunner:
             if failures and not (self.allow_partial and configuration.more_features):
                 return replace(attempt, failures=tuple(failures))
             if not configuration.learned:
-                job = self._match(job, configuration)
-            verified = self._verified_pairs(Path(job.database))
+                project = self._with_matches(project, configuration)
+            verified = self._verified_pairs(project.database)
             attempt = replace(
                 attempt,
-                pairs_matched=len(sqlite.inliers_of_pairs(Path(job.database))),
+                pairs_matched=len(sqlite.inliers_of_pairs(project.database)),
                 pairs_verified=len(verified),
             )
             failures = check_pairs(verified, photographs)
@@ -110,18 +120,18 @@ class AttemptRunner:
                 return replace(attempt, failures=tuple(failures))
         except WorkerTimedOut as late:
             return Attempt(configuration, (late,), empty)
-        return self._mapped(job, attempt, failures)
+        return self._mapped(project, attempt, failures)
 
-    def _mapped(self, job: Job, attempt: Attempt, before: list[SplatError]) -> Attempt:
-        """The attempt with the model of `job` and its failures, added to those `before`."""
+    def _mapped(self, project: Project, attempt: Attempt, before: list[SplatError]) -> Attempt:
+        """The attempt with the model of `project` and its failures, added to those `before`."""
         try:
-            self._map(job, attempt.configuration)
+            self._map(project, attempt.configuration)
         except WorkerTimedOut:
             statistics = replace(attempt.statistics, timed_out=True)
             return replace(attempt, statistics=statistics, failures=tuple(check_model(statistics)))
         except WorkerCrashed as crash:
             return replace(attempt, failures=(crash,))
-        result = load_result(Path(job.out))
+        result = load_result(self._model_folder(attempt.configuration))
         if result.model is not None:
             result = replace(result, model=without_implausible_views(result.model))
         statistics = model_statistics(result, attempt.statistics.photographs)
@@ -131,113 +141,108 @@ class AttemptRunner:
 
     def _verified_pairs(self, database: Path) -> list[tuple[int, int, int, int]]:
         """`database.verified_pairs` with numbers of frames for positions."""
-        frames = self.base.frames.tolist()
+        frames = self.project.photographs.frame_of
         pairs = sqlite.verified_pairs(database)
-        return [(frames[first], frames[second], *rest) for first, second, *rest in pairs]
+        return [(frames[i], frames[j], inliers, kind) for i, j, inliers, kind in pairs]
 
-    def _job(self, configuration: Configuration) -> Job:
-        base, more = self.base, configuration.more_features
-        model_folder = "model-" + re.sub(r"\W+", "-", configuration.name)
-        return replace(
-            base,
-            database=str(self.folder / ("more.db" if more else "base.db")),
-            out=str(self.folder / model_folder),
-            max_features=round(base.max_features * (MORE_FEATURES if more else 1)),
-            peak_threshold=base.peak_threshold * (LOWER_PEAK if more else 1.0),
-            matching="exhaustive" if more else base.matching,
-            drop_stationary=configuration.drop_stationary,
-            loose=configuration.loose,
-            strongest_start=configuration.strongest_start,
-        )
+    def _model_folder(self, configuration: Configuration) -> Path:
+        name = "model-" + re.sub(r"\W+", "-", configuration.name)
+        return self.project.database.with_name(name)
 
-    def _extract_features(self, job: Job) -> None:
-        database = Path(job.database)
-        marker = database.with_suffix(".features-done")
-        if marker.exists() and database.exists():
-            return
-        sqlite.repair_or_delete(database)
-        if self.executor is not None:
-            with self._timed("features"):
-                extract_features_in_chunks(job, self.executor, self._check_deadline)
-        self._run(replace(job, step="features"))
-        marker.touch()
+    def _with_features(self, configuration: Configuration) -> Project:
+        """Extract features; returns the project with their database."""
+        project, sift = self.project, self.sift
+        if configuration.more_features:
+            project = replace(project, database=project.database.with_name("more.db"))
+            most = round(sift.max_features * MORE_FEATURES)
+            sift = Sift(most, sift.peak_threshold * LOWER_PEAK)
+        marker = project.database.with_suffix(".features-done")
+        if not (marker.exists() and project.database.exists()):
+            sqlite.repair_or_delete(project.database)
+            job = Features(project, sift)
+            if self.executor is not None:
+                with self._timed("features"):
+                    extract_features_in_chunks(job, self.executor, self._check_deadline)
+            self._run(job)
+            marker.touch()
+        return project
 
-    def _match(self, job: Job, configuration: Configuration) -> Job:
-        """Match; returns the job with the database that holds the two-view geometries to use."""
-        database = Path(job.database)
+    def _with_matches(self, project: Project, configuration: Configuration) -> Project:
+        """Match; returns the project with the database of the two-view geometries to use."""
+        how = "exhaustive" if configuration.more_features else self.matching
         if configuration.drop_stationary:
-            copied = database.with_name(database.stem + "-moving.db")
-            if not copied.exists():
-                sqlite.copy(database, copied)
-                sqlite.delete_geometries(copied)
-            database = copied
-            job = replace(job, database=str(copied))
-        marker = database.with_suffix(f".{job.matching}-done")
-        if marker.exists() and database.exists():
-            return job
+            source = project.database
+            project = replace(project, database=source.with_name(source.stem + "-moving.db"))
+            if not project.database.exists():
+                sqlite.copy(source, project.database)
+                sqlite.delete_geometries(project.database)
+        marker = project.database.with_suffix(f".{how}-done")
+        if marker.exists() and project.database.exists():
+            return project
         if not configuration.drop_stationary:
-            sqlite.repair(database)
+            sqlite.repair(project.database)
+        job = Matching(project, how, configuration.drop_stationary)
         if self.executor is not None:
             self._match_in_chunks(job, self.executor)
-        self._run(replace(job, step="matching"))
+        self._run(job)
         marker.touch()
-        return job
+        return project
 
-    def _match_learned(self, job: Job) -> Job:
-        """Add learned features and matches to those of the matched `job`; returns the job with the
-        database of both."""
-        source = Path(job.database)
-        target = source.with_name(f"{source.stem}-learned.db")
-        learned = replace(job, database=str(target), source=job.database)
-        if not target.exists():  # it appears when it is complete
-            photographs = self._unregistered(source)
-            self._run(replace(learned, step="learned", photographs=photographs))
-        return learned
+    def _with_learned(self, project: Project) -> Project:
+        """Add learned features and their matches to those of SIFT in the database of `project`;
+        returns the project with the database of both."""
+        source = project.database
+        project = replace(project, database=source.with_name(f"{source.stem}-learned.db"))
+        if not project.database.exists():  # it appears when it is complete
+            self._run(Learned(project, source, self._unregistered(source)))
+        return project
 
     def _unregistered(self, database: Path) -> tuple[int, ...]:
         """Positions of the photographs that SIFT left out: of its model, or where mapping was not
         reached, of the largest group that its matches link."""
-        everyone = range(len(self.base.names))
-        model_folder = Path(self._job(CONFIGURATIONS[0]).out)
+        all_names = self.project.photographs.names
+        model_folder = self._model_folder(CONFIGURATIONS[0])
         registered: set[int] = set()
         if self.join_all:
             pass
         elif _is_mapped(model_folder):
             model = load_result(model_folder).model
             names = () if model is None else without_implausible_views(model).names
-            registered = {self.base.names.index(name) for name in names}
+            registered = {all_names.index(name) for name in names}
         else:
-            frames = self.base.frames
+            frames = self.project.photographs.frames
             linked = connected_groups(self._verified_pairs(database), int(frames.max()) + 1)[0]
             registered = set(np.flatnonzero(np.isin(frames, linked)).tolist())
-        return tuple(i for i in everyone if i not in registered)
+        return tuple(i for i in range(len(all_names)) if i not in registered)
 
-    def _match_in_chunks(self, job: Job, executor: ChunkExecutor) -> None:
+    def _match_in_chunks(self, job: Matching, executor: ChunkExecutor) -> None:
         """Match until no pair is left to select; the selection depends on earlier matches."""
         left = 1
         while left:
-            self._run(replace(job, step="pair selection"))
+            self._run(PairSelection(job.project, job.how))
             with self._timed("matching"):
                 left = match_pairs_in_chunks(job, executor, self._check_deadline)
 
     def _check_deadline(self) -> None:
         if self.out_of_time():
-            raise WorkerTimedOut(len(self.base.names))
+            raise WorkerTimedOut(len(self.project.photographs))
 
-    def _map(self, job: Job, configuration: Configuration) -> None:
-        if _is_mapped(Path(job.out)):
+    def _map(self, project: Project, configuration: Configuration) -> None:
+        out = self._model_folder(configuration)
+        if _is_mapped(out):
             return
-        budget = min(self.seconds_left(), mapping_seconds(len(job.names)))
-        job = replace(job, step="mapping", max_seconds=max(1, int(budget)))
+        budget = min(self.seconds_left(), mapping_seconds(len(project.photographs)))
+        seconds = max(1, int(budget))
+        job = Mapping(project, out, seconds, configuration.loose, configuration.strongest_start)
         suffix = "" if configuration is CONFIGURATIONS[0] else f" ({configuration.name})"
         # COLMAP checks its own time limit only between photographs.
-        self._run(job, suffix, job.max_seconds + 60.0)
+        self._run(job, suffix, seconds + 60.0)
 
     def _run(self, job: Job, suffix: str = "", max_seconds: float | None = None) -> None:
         """Run one step in a worker. suffix: of the phases in progress reports."""
         seconds = self.seconds_left() if max_seconds is None else max_seconds
         with self._timed("matching" if job.step == "pair selection" else job.step):
-            run_step(job, self.folder, self.report, seconds, suffix)
+            run_step(job, self.project.database.parent, self.report, seconds, suffix)
 
     @contextmanager
     def _timed(self, step: str) -> Iterator[None]:

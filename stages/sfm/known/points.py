@@ -1,7 +1,5 @@
-"""Points for known cameras: from their file, triangulated from matches, or drawn at random.
-
-Also: random points in the space that many cameras see, for scenes without any other points.
-"""
+"""Points for known cameras: from their file, triangulated from matches, or drawn at random in the
+space that many cameras see."""
 
 from __future__ import annotations
 
@@ -29,35 +27,32 @@ _VISIBLE_SHARE = 0.1  # of a file's points must be in the pictures of two camera
 def find_points(
     from_file: FilePoints | None,
     triangulated: Path,
-    training: Sequence[int],
     views: Sequence[PinholeView],
     whole: Sequence[Camera],
     folder: Path,
     seed: int,
     report: Report,
 ) -> tuple[FilePoints, Observations]:
-    """The points to start from, and who observes them.
+    """The points to start from, and which views observe them.
 
     Args:
         from_file: the points of the camera file; used if its cameras look at them.
         triangulated: points.npz of `triangulation`.
-        training: positions of the views that may be used.
-        views: all.
-        whole: [V] a pinhole camera of each view's photograph, the same for those of one.
+        views: V training views.
+        whole: [V] a pinhole camera for the photograph of each view.
         folder: of the reconstruction, for masks.
         seed: of random points.
         report: receives the metric "points_source" and warnings.
 
     Raises SplatError "cameras-no-common-view".
     """
-    chosen = [views[i] for i in training]
-    cloud = _visible_file_points(from_file, [view.camera for view in chosen], report)
+    cloud = _visible_file_points(from_file, [view.camera for view in views], report)
     if cloud is not None:
         report.metric("points_source", "camera file")
         return cloud, NO_OBSERVATIONS
-    cloud, observations = _triangulated(triangulated, training)
+    cloud, observations = _triangulated(triangulated)
     source = "triangulation"
-    photographs = {view.number: (whole[i], view) for i, view in zip(training, chosen, strict=True)}
+    photographs = {v.number: (camera, v) for v, camera in zip(views, whole, strict=True)}
     if len(cloud.points) < POINTS_PER_PHOTOGRAPH * len(photographs):
         cameras = [camera for camera, _ in photographs.values()]
         outside = [_empty_space(folder, view) for _, view in photographs.values()]
@@ -85,10 +80,9 @@ def _visible_file_points(
     return replace(found, tracks=np.where(found.tracks > 0, found.tracks, views).astype(np.int32))
 
 
-def _triangulated(path: Path, training: Sequence[int]) -> tuple[FilePoints, Observations]:
+def _triangulated(path: Path) -> tuple[FilePoints, Observations]:
     data = np.load(path)
-    views = np.array(training, np.int32)[data["observing_views"]]
-    observed = Observations(data["observed_points"], views, data["observed_px"])
+    observed = Observations(data["observed_points"], data["observing_views"], data["observed_px"])
     pairs = np.unique(np.stack([observed.points, observed.views], axis=1), axis=0)
     tracks = np.bincount(pairs[:, 0], minlength=len(data["points"])).astype(np.int32)
     return FilePoints(data["points"], data["colours"], data["errors_px"], tracks), observed

@@ -6,7 +6,8 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,9 +30,20 @@ from stages.sfm.known.pinhole_views import PinholeView, write_pinhole_views
 from stages.sfm.known.points import find_points
 from stages.sfm.place.levelling import levelling_rotation, up_direction
 from stages.sfm.place.metric_scale import KnownScale, find_metric_scale
+from stages.sfm.settings import SfmSettings
 from stages.sfm.undistorted_images import IMAGES, PosedPhoto, mask_file
 from stages.sfm.worker import database as sqlite
-from stages.sfm.worker.job import CameraGuess, Job, prepare_work_folder
+from stages.sfm.worker.job import (
+    CameraGuess,
+    Features,
+    KnownCameras,
+    Neighbours,
+    Photographs,
+    Project,
+    Sift,
+    Triangulation,
+    prepare_work_folder,
+)
 from stages.sfm.worker.pairs import Pair
 from stages.sfm.worker.process import run_step
 from stages.sfm.worker.sparse_model import camera_centres
@@ -42,64 +54,61 @@ EXHAUSTIVE_UP_TO = 25  # views
 _SAME_PART = 1e-6  # difference of the rotations of two faces in the same direction
 INLIER_RATIO, ROUGH_INLIER_RATIO = 0.5, 0.5  # of the median pair; rough: at four times the distance
 FEWEST_PAIRS = 3
+POINTS = "points.npz"  # in the folder that `triangulation` writes
 
 
 def reconstruct(
     capture: Capture,
     path: Path,
+    settings: SfmSettings,
     folder: Path,
     work: Path,
     report: Report,
-    *,
-    split: bool,
-    refine: bool,
-    allow_partial: bool,
-    seed: int,
-    max_features: int,
-    known_scale: KnownScale,
-    seconds_left: Callable[[], float],
 ) -> Reconstruction:
     """The capture with the cameras in `path`. Writes what `finish.finish` writes.
 
     Args:
         capture: the photographs.
         path: a camera file or folder.
+        settings: of the stage.
         folder: of the reconstruction.
         work: folder for what an interrupted run resumes from.
         report: receives metrics, warnings and progress.
-        split: see `match_cameras`.
-        refine: refine the poses by bundle adjustment.
-        allow_partial: accept missing cameras and poses that do not fit the matches.
-        seed, max_features: of features and matching.
-        known_scale: what is known of the size of the scene.
-        seconds_left: until the deadline.
 
     Raises SplatError, and Interrupted.
     """
+    deadline = time.monotonic() + 60.0 * settings.max_minutes
     found = read_cameras(path)
     from_file = read_points(path)
-    posed = match_cameras(found, capture, split, allow_partial, report)
-    _check_usable(posed, refine)
+    posed = match_cameras(found, capture, settings.split, settings.allow_partial, report)
+    _check_usable(posed, settings.refine_cameras)
     shutil.rmtree(folder / COLMAP, ignore_errors=True)
     views = write_pinhole_views(posed, capture.folder, folder, report)
-    training = [i for i, view in enumerate(views) if posed[view.number].role != "test"]
-    job = _job([views[i] for i in training], folder, work, seed, max_features, refine)
-    _match(job, work, report, seconds_left)
-    triangulated = Path(job.out) / "points.npz"
-    _check_poses(Path(job.out), report, allow_partial)
-    if refine:
-        views = _refined(views, triangulated, report)
-    cloud, observations = find_points(
-        from_file, triangulated, training, views, _whole(views, posed), folder, seed, report
-    )
-    known_scale = replace(known_scale, georeference=found.georeference)
     roles = [posed[view.number].role for view in views]
-    return _finish(views, roles, cloud, observations, folder, report, known_scale)
+    training = [i for i, role in enumerate(roles) if role != "test"]
+    project = _project([views[i] for i in training], folder, work, settings.seed)
+    known = _known_cameras([views[i] for i in training])
+    out = _match(project, known, settings, work, deadline, report)
+    _check_poses(out, report, settings.allow_partial)
+    if settings.refine_cameras:
+        views = _refined(views, out / POINTS, report)
+    chosen = [views[i] for i in training]
+    whole = _whole(chosen, posed)
+    cloud, observed = find_points(
+        from_file, out / POINTS, chosen, whole, folder, settings.seed, report
+    )
+    observed = replace(observed, views=np.array(training, np.int32)[observed.views])
+    scale = KnownScale(
+        settings.scale, settings.marker, settings.crs, settings.metres, found.georeference
+    )
+    done = _finish(views, cloud, observed, scale, folder, report)
+    with_roles = zip(done.views, roles, strict=True)
+    return replace(done, views=tuple(replace(view, role=role) for view, role in with_roles))
 
 
 def _whole(views: Sequence[PinholeView], posed: Sequence[PosedPhoto]) -> list[Camera]:
-    """[V] one camera for all views of a photograph: of each, the pinhole camera that shows most of
-    what the photograph shows, whose axis is the photograph's."""
+    """[V] a pinhole camera for the photograph of each view: along the photograph's own axis, and as
+    wide as one pinhole picture can be."""
     cameras = []
     for view in views:
         camera = view.camera
@@ -118,43 +127,29 @@ def _of_photograph(view: PinholeView) -> NDArray[np.float64]:
     return pose
 
 
-def _job(
-    views: Sequence[PinholeView],
-    folder: Path,
-    work: Path,
-    seed: int,
-    max_features: int,
-    refine: bool,
-) -> Job:
-    """The job for the training views, each with a camera of its own. The faces of a photograph are
-    a rig."""
-    photos, chosen = [view.photo for view in views], [view.camera for view in views]
-    photographs = np.unique([view.number for view in views], return_inverse=True)[1]
-    poses = np.array([camera.world_to_camera for camera in chosen])
-    rotations = np.array([view.rotation for view in views])
-    job = Job(
-        step="",
-        images_root=str((folder / IMAGES).resolve()),
-        database=str(work / "known.db"),
-        out=str(work / "known"),
+def _project(views: Sequence[PinholeView], folder: Path, work: Path, seed: int) -> Project:
+    """The project of the training views, each with a camera of its own. The faces of a photograph
+    are a rig."""
+    photos = [view.photo for view in views]
+    numbers = np.unique([view.number for view in views], return_inverse=True)[1]
+    photographs = Photographs(
+        folder=(folder / IMAGES).resolve(),
         names=tuple(photo.picture for photo in photos),
         masks=tuple(_mask_from_images(photo) for photo in photos),
         camera_of=tuple(range(len(views))),
-        frame_of=tuple(photographs.tolist()),
+        frame_of=tuple(numbers.tolist()),
         cameras=tuple(_guess(view) for view in views),
-        seed=seed,
-        threads=threads.count(),
-        max_features=max_features,
-        refine=refine,
-        pairs=tuple(neighbours(poses, rotations, photographs)),
-        known={
-            "intrinsics": [(c.fx, c.fy, c.cx, c.cy) for c in chosen],
-            "world_to_camera": poses.tolist(),
-            "rotations": rotations.tolist(),
-        },
     )
-    prepare_work_folder(work, job)
-    return job
+    return Project(work / "known.db", photographs, seed, threads.count())
+
+
+def _known_cameras(views: Sequence[PinholeView]) -> KnownCameras:
+    cameras = [view.camera for view in views]
+    return KnownCameras(
+        intrinsics=np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras]),
+        world_to_camera=np.array([camera.world_to_camera for camera in cameras]),
+        rotations=np.array([view.rotation for view in views]),
+    )
 
 
 def _guess(view: PinholeView) -> CameraGuess:
@@ -202,14 +197,31 @@ def neighbours(
     return list(zip(first.tolist(), second.tolist(), strict=True))
 
 
-def _match(job: Job, work: Path, report: Report, seconds_left: Callable[[], float]) -> None:
-    """Features, matches, and the check of poses and points from matches; skips finished steps."""
-    for step in ("features", "neighbours", "triangulation"):
-        marker = work / f"{step}.done"
+def _match(
+    project: Project,
+    known: KnownCameras,
+    settings: SfmSettings,
+    work: Path,
+    deadline: float,
+    report: Report,
+) -> Path:
+    """Features, matches, and the check of poses and points from matches; skips finished steps.
+    Returns the folder that the last step writes. deadline: of `time.monotonic`."""
+    sift, refine, out = Sift(settings.max_features), settings.refine_cameras, work / "known"
+    frames = project.photographs.frames
+    pairs = tuple(neighbours(known.world_to_camera, known.rotations, frames))
+    prepare_work_folder(work, project, sift, known, pairs, refine)
+    for job in (
+        Features(project, sift),
+        Neighbours(project, known.intrinsics, pairs),
+        Triangulation(project, out, known, refine),
+    ):
+        marker = work / f"{job.step}.done"
         if not marker.exists():
-            sqlite.repair_or_delete(Path(job.database))
-            run_step(replace(job, step=step), work, report, seconds_left())
+            sqlite.repair_or_delete(project.database)
+            run_step(job, work, report, deadline - time.monotonic())
             marker.touch()
+    return out
 
 
 def _refined(views: Sequence[PinholeView], path: Path, report: Report) -> list[PinholeView]:
@@ -274,12 +286,11 @@ def _check_poses(out: Path, report: Report, allow_partial: bool) -> None:
 
 def _finish(
     views: Sequence[PinholeView],
-    roles: Sequence[str],
     cloud: FilePoints,
     observations: Observations,
+    known_scale: KnownScale,
     folder: Path,
     report: Report,
-    known_scale: KnownScale,
 ) -> Reconstruction:
     """Level, recentre and scale; write the COLMAP model."""
     georeference = known_scale.georeference
@@ -307,7 +318,6 @@ def _finish(
         observations,
         levelled=levelled,
         metric=scale,
-        roles=roles,
     )
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,10 @@ from numpy.typing import NDArray
 from stages.cameras.camera_file import poses_of
 from stages.scene.rotations import similarity
 from stages.sfm.known.epipolar import likely_mistakes, median_inlier_ratio
-from stages.sfm.worker.job import Job
-from stages.sfm.worker.mapping import point_arrays, verified_matches
+from stages.sfm.worker.job import CameraGuess, KnownCameras, Neighbours, Project, Triangulation
+from stages.sfm.worker.mapping import point_arrays
 from stages.sfm.worker.matching import match_pairs
+from stages.sfm.worker.pair_checks import verified_matches
 from stages.sfm.worker.sparse_model import camera_centres
 
 # Factor on COLMAP's error thresholds of triangulation, for each round of refinement: with the usual
@@ -24,29 +26,27 @@ from stages.sfm.worker.sparse_model import camera_centres
 REFINEMENTS = (8.0, 4.0, 2.0, 1.0, 1.0)
 
 
-def match_neighbours(job: Job) -> None:
+def match_neighbours(job: Neighbours) -> None:
     """Match and verify the selected pairs, with the exact intrinsics of the known cameras."""
-    with pycolmap.Database.open(job.database) as database:
-        for camera in _cameras(job):
+    with pycolmap.Database.open(job.project.database) as database:
+        for camera in _cameras(job.project.photographs.cameras, job.intrinsics):
             database.update_camera(camera)
-    match_pairs(job, list(job.pairs))
+    match_pairs(job.project, job.pairs)
 
 
-def triangulate(job: Job) -> None:
+def triangulate(job: Triangulation) -> None:
     """Check the poses against the matches, and triangulate points with the poses held fixed.
 
     Writes to `job.out`: pose_check.json, inlier ratios of the given poses and of corrections of
-    likely mistakes (see `epipolar`); points.npz, points, observations and poses.
+    likely mistakes (see `known.epipolar`); points.npz, points, observations and poses.
     """
-    lens, poses, faces = (
-        np.array(job.known[name]) for name in ("intrinsics", "world_to_camera", "rotations")
-    )
-    out = Path(job.out)
+    lens, poses, out = job.cameras.intrinsics, job.cameras.world_to_camera, job.out
+    photographs = job.project.photographs
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
-    pairs = _matched_points(Path(job.database))
-    mistakes = _corrected(poses, faces, job.frames)
-    side = float(max(max(camera.width, camera.height) for camera in job.cameras))
+    pairs = _matched_points(job.project.database)
+    mistakes = _corrected(poses, job.cameras.rotations, photographs.frames)
+    side = float(max(max(camera.width, camera.height) for camera in photographs.cameras))
     found = {
         "pairs": len(pairs),
         "matches": sum(len(pair[2]) for pair in pairs),
@@ -58,7 +58,7 @@ def triangulate(job: Job) -> None:
         },
     }
     if job.refine:
-        poses = _refined(job, poses, out / "colmap")
+        poses = _refined(job, out / "colmap")
         found["refined"] = median_inlier_ratio(pairs, lens, poses, side)
     (out / "pose_check.json").write_text(json.dumps(found), encoding="utf-8")
     _save_points(_triangulated(job, poses, out / "colmap"), poses, out / "points.npz")
@@ -81,9 +81,11 @@ def _corrected(
     return {name: turns @ fixed[photographs] for name, fixed in likely_mistakes(whole).items()}
 
 
-def _cameras(job: Job) -> Iterator[pycolmap.Camera]:
-    """The camera of each view, with the number of its photograph."""
-    known = zip(job.cameras, job.known["intrinsics"], strict=True)
+def _cameras(
+    guesses: Sequence[CameraGuess], intrinsics: NDArray[np.float64]
+) -> Iterator[pycolmap.Camera]:
+    """The pinhole cameras of all views; their ids are positions + 1."""
+    known = zip(guesses, intrinsics, strict=True)
     for number, (guess, params) in enumerate(known, 1):
         size = {"width": guess.width, "height": guess.height}
         camera = pycolmap.Camera(camera_id=number, model="PINHOLE", params=params, **size)
@@ -106,14 +108,14 @@ def _matched_points(path: Path) -> list[tuple[int, int, NDArray[np.float64], NDA
     return found
 
 
-def _refined(job: Job, given: NDArray[np.float64], scratch: Path) -> NDArray[np.float64]:
-    """[V, 4, 4] the `given` poses after rounds of triangulation and bundle adjustment, with fixed
+def _refined(job: Triangulation, scratch: Path) -> NDArray[np.float64]:
+    """[V, 4, 4] the given poses after rounds of triangulation and bundle adjustment, with fixed
     intrinsics.
 
     Early rounds use wide error thresholds, since the poses are rough. The result is aligned to the
     given camera centres by a similarity, so that the world stays the given one.
     """
-    poses = given
+    poses = given = job.cameras.world_to_camera
     for slack in REFINEMENTS:
         model = _triangulated(job, poses, scratch, slack)
         options = pycolmap.BundleAdjustmentOptions()
@@ -133,46 +135,45 @@ def _refined(job: Job, given: NDArray[np.float64], scratch: Path) -> NDArray[np.
 
 
 def _triangulated(
-    job: Job, poses: NDArray[np.float64], scratch: Path, slack: float = 1.0
+    job: Triangulation, poses: NDArray[np.float64], scratch: Path, slack: float = 1.0
 ) -> pycolmap.Reconstruction:
     """Triangulate the matches with fixed poses [V, 4, 4]. slack: factor on COLMAP's error
     thresholds."""
     scratch.mkdir()
-    model = _posed(job, poses)
+    project, folder = job.project, job.project.photographs.folder
+    model = _posed(project, replace(job.cameras, world_to_camera=poses))
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
-    options.random_seed = options.mapper.random_seed = job.seed
+    options.random_seed = options.mapper.random_seed = project.seed
     triangulation = options.triangulation
-    triangulation.random_seed = job.seed
+    triangulation.random_seed = project.seed
     triangulation.create_max_angle_error *= slack
     triangulation.continue_max_angle_error *= slack
     triangulation.merge_max_reproj_error *= slack
     triangulation.complete_max_reproj_error *= slack
     options.mapper.filter_max_reproj_error *= slack
-    model = pycolmap.triangulate_points(
-        model, job.database, job.images_root, scratch, options=options
-    )
-    model.extract_colors_for_all_images(job.images_root, num_threads=1)
+    model = pycolmap.triangulate_points(model, project.database, folder, scratch, options=options)
+    model.extract_colors_for_all_images(folder, num_threads=1)
     model.update_point_3d_errors()
     shutil.rmtree(scratch)
     return model
 
 
-def _posed(job: Job, poses: NDArray[np.float64]) -> pycolmap.Reconstruction:
-    """A model of the views, without points, with the rigs and frames of the database. Each view has
-    a camera of its own with the same number."""
+def _posed(project: Project, known: KnownCameras) -> pycolmap.Reconstruction:
+    """A model of the views, without points, with the rigs and frames of the database. The camera of
+    each view has the id of its image."""
     model = pycolmap.Reconstruction()
-    for camera in _cameras(job):
+    for camera in _cameras(project.photographs.cameras, known.intrinsics):
         model.add_camera(camera)
     frame_of: dict[int, int] = {}
-    with pycolmap.Database.open(job.database) as database:
+    with pycolmap.Database.open(project.database) as database:
         for rig in database.read_all_rigs():
             model.add_rig(rig)
         for frame in database.read_all_frames():
             frame_of |= {data.id: frame.frame_id for data in frame.data_ids}
-            frame.rig_from_world = pycolmap.Rigid3d(poses[frame.rig_id - 1, :3])
+            frame.rig_from_world = pycolmap.Rigid3d(known.world_to_camera[frame.rig_id - 1, :3])
             model.add_frame(frame)
-    for number, name in enumerate(job.names, 1):
+    for number, name in enumerate(project.photographs.names, 1):
         image = pycolmap.Image(name=name, camera_id=number, image_id=number)
         image.frame_id = frame_of[number]
         model.add_image(image)

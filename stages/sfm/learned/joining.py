@@ -11,7 +11,6 @@ import os
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
-from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -23,9 +22,10 @@ from stages.sfm.learned.features import LearnedFeatures, XFeat, mutual_nearest
 from stages.sfm.learned.matching import LighterGlue
 from stages.sfm.worker import database as sqlite
 from stages.sfm.worker.features import read_grey
-from stages.sfm.worker.job import Job, ProgressWriter
-from stages.sfm.worker.matching import two_view_geometry
+from stages.sfm.worker.job import Learned, Project
+from stages.sfm.worker.matching import cameras_of, two_view_geometry
 from stages.sfm.worker.pairs import Pair, joining_pairs, without_weaker
+from stages.sfm.worker.progress import ProgressWriter
 
 COMPARED = 512  # features of a photograph, the best, for the choice of pairs
 LEAST_COSINE = 0.82  # as XFeat's authors have it for matches without LighterGlue
@@ -33,54 +33,58 @@ FEWEST_INLIERS = 30  # of a pair; of SIFT's, for a pair that SIFT verifies
 _SCALE = 4.0  # of a keypoint, pixels; COLMAP does not use it
 
 
-def match_learned(job: Job) -> None:
-    """Write `job.database`: a copy of `job.source` with learned keypoints, and matches that may
-    join `job.photographs` to the others."""
+def match_learned(job: Learned) -> None:
+    """Write the project's database: a copy of `job.source` with learned keypoints, and matches that
+    may join the photographs at `job.positions` to the others."""
     torch_vml.warm_up()
     torch.set_num_threads(1)  # photographs and pairs run side by side
-    partial = Path(job.database).with_suffix(".partial.db")
-    sqlite.copy(Path(job.source), partial)
-    features = _features(job)
+    project = job.project
+    partial = project.database.with_suffix(".partial.db")
+    sqlite.copy(job.source, partial)
+    features = _features(project)
     inliers = sqlite.inliers_of_pairs(partial)
-    wanted = joining_pairs(_likeness(job, features), inliers, job.photographs)
+    wanted = joining_pairs(_likeness(job, features), inliers, job.positions)
     with (
-        closing(sqlite.StoredFeatures(Path(job.source), immutable=True)) as stored,
+        closing(sqlite.StoredFeatures(job.source, immutable=True)) as stored,
         pycolmap.Database.open(partial) as database,
     ):
         _write_keypoints(database, features)
-        _write_matches(job, database, stored, features, wanted)
-    os.replace(partial, job.database)
+        matcher = _Matcher(project.seed, cameras_of(project, database), stored, features)
+        inliers = {pair: count for pair, count in inliers.items() if count}
+        _write_matches(project, database, matcher, inliers, wanted)
+    os.replace(partial, project.database)
 
 
-def _features(job: Job) -> list[LearnedFeatures]:
+def _features(project: Project) -> list[LearnedFeatures]:
     """The learned features of each photograph, by position."""
-    network, root, progress = XFeat(), Path(job.images_root), ProgressWriter(job)
+    network, progress = XFeat(), ProgressWriter(project.database)
+    photographs = project.photographs
 
     def of_photograph(position: int) -> LearnedFeatures:
-        mask = job.masks[position]
-        picture = read_grey(root / job.names[position])
-        return network.features(picture, read_grey(root / mask) if mask else None)
+        mask = photographs.masks[position]
+        picture = read_grey(photographs.folder / photographs.names[position])
+        return network.features(picture, read_grey(photographs.folder / mask) if mask else None)
 
     found = []
-    with ThreadPoolExecutor(job.threads) as pool:
-        for each in pool.map(of_photograph, range(len(job.names))):
+    with ThreadPoolExecutor(project.threads) as pool:
+        for each in pool.map(of_photograph, range(len(photographs))):
             found.append(each)
-            progress.write("learned features", len(found), len(job.names))
+            progress.write("learned features", len(found), len(photographs))
     return found
 
 
-def _likeness(job: Job, features: list[LearnedFeatures]) -> NDArray[np.int32]:
-    """[P, P] mutual nearest neighbours of the best features of `job.photographs` and all others; 0
-    for pairs without one of them."""
-    frames = job.frames
-    photographs, progress = len(features), ProgressWriter(job)
+def _likeness(job: Learned, features: list[LearnedFeatures]) -> NDArray[np.int32]:
+    """[P, P] mutual nearest neighbours among the best features of two photographs; 0 for pairs
+    without a photograph at `job.positions`."""
+    frames = job.project.photographs.frames
+    photographs, progress = len(features), ProgressWriter(job.project.database)
     likeness = np.zeros((photographs, photographs), np.int32)
-    for done, i in enumerate(job.photographs, 1):
+    for done, i in enumerate(job.positions, 1):
         for j in range(photographs):
             if frames[j] != frames[i] and not likeness[i, j]:
                 count = mutual_nearest(features[i], features[j], COMPARED, LEAST_COSINE)
                 likeness[i, j] = likeness[j, i] = count
-        progress.write("selecting pairs", done, len(job.photographs))
+        progress.write("selecting pairs", done, len(job.positions))
     return likeness
 
 
@@ -94,22 +98,22 @@ def _write_keypoints(database: pycolmap.Database, features: Iterable[LearnedFeat
 
 
 def _write_matches(
-    job: Job,
+    project: Project,
     database: pycolmap.Database,
-    stored: sqlite.StoredFeatures,
-    features: list[LearnedFeatures],
+    matcher: _Matcher,
+    inliers: dict[Pair, int],
     wanted: list[Pair],
 ) -> None:
-    """Match the `wanted` pairs, add SIFT's matches, verify both together and write them, but for
-    pairs that only learned features verify and that stronger ones make redundant."""
-    progress = ProgressWriter(job)
-    matcher = _Matcher(job, [database.read_camera(camera + 1) for camera in job.camera_of])
-    inliers = sqlite.inliers_of_pairs(Path(job.source))
-    inliers = {pair: count for pair, count in inliers.items() if count}
+    """Match the `wanted` pairs, add SIFT's matches, verify both together and write them. A pair
+    that only learned features verify gets no geometry if stronger pairs make it redundant.
+
+    inliers: of the pairs that SIFT verified; the `wanted` pairs are added.
+    """
+    progress = ProgressWriter(project.database)
     found: dict[Pair, tuple[NDArray[np.uint32], pycolmap.TwoViewGeometry]] = {}
     uncertain = []
-    with ThreadPoolExecutor(job.threads) as pool:
-        results = pool.map(lambda pair: matcher.match(pair, stored, features), wanted)
+    with ThreadPoolExecutor(project.threads) as pool:
+        results = pool.map(matcher.match, wanted)
         for pair, (matches, geometry, by_sift) in zip(wanted, results, strict=True):
             found[pair] = matches, geometry
             inliers[pair] = len(geometry.inlier_matches)
@@ -131,24 +135,29 @@ def _write_matches(
 class _Matcher:
     """Matches and verifies pairs; several threads may use it at once."""
 
-    def __init__(self, job: Job, cameras: list[pycolmap.Camera]) -> None:
-        self._job, self._cameras, self._network = job, cameras, LighterGlue()
+    def __init__(
+        self,
+        seed: int,
+        cameras: list[pycolmap.Camera],
+        stored: sqlite.StoredFeatures,
+        features: list[LearnedFeatures],
+    ) -> None:
+        self._seed, self._cameras, self._network = seed, cameras, LighterGlue()
+        self._stored, self._features = stored, features
 
-    def match(
-        self, pair: Pair, stored: sqlite.StoredFeatures, features: list[LearnedFeatures]
-    ) -> tuple[NDArray[np.uint32], pycolmap.TwoViewGeometry, int]:
+    def match(self, pair: Pair) -> tuple[NDArray[np.uint32], pycolmap.TwoViewGeometry, int]:
         """(matches by SIFT and learned features, two-view geometry, how many of its inliers are
         SIFT's)."""
-        sift = stored.matches(*pair)
+        sift = self._stored.matches(*pair)
         sift = np.empty((0, 2), np.uint32) if sift is None else sift
-        points = [stored.points(position) for position in pair]
+        points = [self._stored.points(position) for position in pair]
         starts = np.array([len(each) for each in points], np.uint32)
-        learned = self._network.matches(*(features[position] for position in pair)) + starts
+        learned = self._network.matches(*(self._features[position] for position in pair)) + starts
         matches = np.concatenate((sift, learned))
         first, second = (
-            (self._cameras[position], np.concatenate((each, features[position].points)))
+            (self._cameras[position], np.concatenate((each, self._features[position].points)))
             for position, each in zip(pair, points, strict=True)
         )
-        geometry = two_view_geometry(first, second, matches, self._job)
+        geometry = two_view_geometry(first, second, matches, self._seed)
         inliers = np.asarray(geometry.inlier_matches).reshape(-1, 2)
         return matches, geometry, int((inliers[:, 0] < starts[0]).sum())

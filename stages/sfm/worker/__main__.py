@@ -7,38 +7,40 @@ links the system's zlib. In a separate process neither can end a run.
 import zlib  # noqa: F401, I001 - must come before pycolmap: see above
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from stages.base.parent import die_with_parent
-from stages.sfm.worker.job import Job
+from stages.sfm.worker import job as jobs
 
 
 def main(arguments: list[str]) -> int:
     """Run the job named on the command line. Returns the exit status (0: done)."""
     die_with_parent()
-    job = Job.read(Path(arguments[0]))
+    job = jobs.Job.read(Path(arguments[0]))
     # COLMAP loads once the process ends with its parent.
     from stages.sfm.known import triangulation
     from stages.sfm.worker import features, mapping, matching
 
-    steps = {
-        "features": features.extract_features,
-        "matching": matching.match_all,
-        "mapping": mapping.map_photographs,
+    steps: dict[type[jobs.Job], Callable[[Any], None]] = {
+        jobs.Features: features.extract_features,
+        jobs.Matching: matching.match_all,
+        jobs.Learned: _match_learned,
+        jobs.Mapping: mapping.map_photographs,
         # with known cameras
-        "neighbours": triangulation.match_neighbours,
-        "triangulation": triangulation.triangulate,
+        jobs.Neighbours: triangulation.match_neighbours,
+        jobs.Triangulation: triangulation.triangulate,
         # with an executor
-        "pair selection": matching.select_pairs,
-        "features chunk": features.extract_chunk,
-        "matching chunk": matching.match_chunk,
-        "learned": _match_learned,
+        jobs.FeaturesChunk: features.extract_chunk,
+        jobs.PairSelection: matching.select_pairs,
+        jobs.MatchingChunk: matching.match_chunk,
     }
-    steps[job.step](job)
+    steps[type(job)](job)
     return 0
 
 
-def _match_learned(job: Job) -> None:
+def _match_learned(job: jobs.Learned) -> None:
     from stages.sfm.learned import joining  # imports torch, which takes seconds
 
     joining.match_learned(job)

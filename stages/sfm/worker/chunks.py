@@ -20,7 +20,15 @@ from threading import Event
 from stages.base import threads
 from stages.base.blocks import blocks
 from stages.sfm.worker import database as sqlite
-from stages.sfm.worker.job import Job, chunks_path, selected_pairs_path
+from stages.sfm.worker.job import (
+    Features,
+    FeaturesChunk,
+    Job,
+    Matching,
+    MatchingChunk,
+    chunks_path,
+    selected_pairs_path,
+)
 from stages.sfm.worker.pairs import Pair
 from stages.sfm.worker.process import run_worker
 
@@ -34,7 +42,7 @@ class Chunk:
     """Some photographs or pairs of a job.
 
     Args:
-        job: file of the whole job.
+        job: file of the whole job, `Features` or `Matching`.
         out: the database to write.
         photographs: positions of photographs, for features.
         pairs: pairs of positions of photographs, for matching.
@@ -52,22 +60,26 @@ either pass through; raises Interrupted when it is stopped."""
 
 
 def extract_features_in_chunks(
-    job: Job, executor: ChunkExecutor, on_chunk: Callable[[], None]
+    job: Features, executor: ChunkExecutor, on_chunk: Callable[[], None]
 ) -> None:
-    """Extract the features that neither the job's database nor a finished chunk holds."""
+    """Extract the features that neither the database nor a finished chunk holds."""
     have: set[int] = set()
-    for database in (Path(job.database), *chunks_path(job).glob("*.db")):
+    for database in (job.project.database, *chunks_path(job.project.database).glob("*.db")):
         if database.exists():
             have |= sqlite.photographs_with_features(database)
-    missing = [position for position in range(len(job.names)) if position not in have]
+    photographs = range(len(job.project.photographs))
+    missing = [position for position in photographs if position not in have]
     file, folder = _write_job(job)
     parts = (tuple(missing[part]) for part in blocks(len(missing), PHOTOGRAPHS_PER_CHUNK))
     executor([Chunk(file, folder / f"photograph-{p[0]}.db", p) for p in parts], on_chunk)
 
 
-def match_pairs_in_chunks(job: Job, executor: ChunkExecutor, on_chunk: Callable[[], None]) -> int:
+def match_pairs_in_chunks(
+    job: Matching, executor: ChunkExecutor, on_chunk: Callable[[], None]
+) -> int:
     """Match the pairs that the step "pair selection" selected; returns how many these are."""
-    pairs = [(first, second) for first, second in json.loads(selected_pairs_path(job).read_text())]
+    selected = json.loads(selected_pairs_path(job.project.database).read_text())
+    pairs = [(first, second) for first, second in selected]
     file, folder = _write_job(job)
     parts = (tuple(pairs[part]) for part in blocks(len(pairs), PAIRS_PER_CHUNK))
     names = ((f"pair-{p[0][0]}-{p[0][1]}.db", p) for p in parts)
@@ -77,8 +89,9 @@ def match_pairs_in_chunks(job: Job, executor: ChunkExecutor, on_chunk: Callable[
 
 def _write_job(job: Job) -> tuple[Path, Path]:
     """(the file of the job, the folder of its chunks), with absolute paths."""
-    job = replace(job, database=str(Path(job.database).absolute()))
-    folder = chunks_path(job)
+    database = job.project.database.absolute()
+    job = replace(job, project=replace(job.project, database=database))
+    folder = chunks_path(database)
     folder.mkdir(exist_ok=True)
     return job.write(folder / "job.json"), folder
 
@@ -87,18 +100,16 @@ def run_chunk(chunk: Chunk) -> None:
     """Run a chunk in a worker process, unless its database exists. Raises SplatError."""
     if chunk.out.exists():
         return
-    job = Job.read(chunk.job)
+    job: Features | Matching = Job.read(chunk.job)
     # A folder of its own: a chunk that seemed lost may run twice at once.
     folder = Path(tempfile.mkdtemp(prefix=f"{chunk.out.stem}-", dir=chunk.out.parent))
-    part = replace(
-        job,
-        step="features chunk" if chunk.photographs else "matching chunk",
-        source=job.database,
-        database=str(folder / "chunk.db"),
-        threads=threads.count(),
-        photographs=chunk.photographs,
-        pairs=chunk.pairs,
-    )
+    project = replace(job.project, database=folder / "chunk.db", threads=threads.count())
+    part: Job
+    if isinstance(job, Features):
+        part = FeaturesChunk(project, job.sift, chunk.photographs)
+    else:
+        source = job.project.database
+        part = MatchingChunk(project, source, chunk.pairs, job.drop_stationary)
     run_worker(part, folder, Event(), _MAX_SECONDS, lambda: None)
-    os.replace(part.database, chunk.out)
+    os.replace(project.database, chunk.out)
     shutil.rmtree(folder, ignore_errors=True)

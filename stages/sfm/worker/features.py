@@ -6,8 +6,9 @@ OpenCV's SIFT is several times as fast as COLMAP's. Features are written as COLM
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -19,7 +20,15 @@ from stages.base import memory
 from stages.base.memory import MIB
 from stages.sfm.worker import database as sqlite
 from stages.sfm.worker import new_database
-from stages.sfm.worker.job import Job, ProgressWriter, chunks_path
+from stages.sfm.worker.job import (
+    Features,
+    FeaturesChunk,
+    Photographs,
+    Project,
+    Sift,
+    chunks_path,
+)
+from stages.sfm.worker.progress import ProgressWriter
 
 LARGEST_SIDE = 3200  # pixels; features of larger photographs are found at this size
 LAYERS = 3  # per octave
@@ -28,62 +37,64 @@ LAYERS = 3  # per octave
 _PIXEL_BYTES = 11 * 4 * 4 * 4 / 3
 _LENGTH = 512.0  # norm of a descriptor
 
-Features = tuple[NDArray[np.float32], NDArray[np.uint8]]
+KeypointsAndDescriptors = tuple[NDArray[np.float32], NDArray[np.uint8]]
 
 
-def extract_features(job: Job) -> None:
-    """Write the SIFT features of every photograph to the job's database, which may already hold
-    some; features of finished chunks are merged first."""
-    path = Path(job.database)
+def extract_features(job: Features) -> None:
+    """Write the SIFT features of every photograph to the database, which may already hold some;
+    features of finished chunks are merged first."""
+    path, photographs = job.project.database, job.project.photographs
     if not path.exists():
-        new_database.create(path, job)
-    sqlite.merge_chunks(path, sorted(chunks_path(job).glob("*.db")))
+        new_database.create(path, photographs)
+    sqlite.merge_chunks(path, sorted(chunks_path(path).glob("*.db")))
     have = sqlite.photographs_with_features(path)
-    missing = [position for position in range(len(job.names)) if position not in have]
-    _extract(job, missing, len(have))
+    missing = [position for position in range(len(photographs)) if position not in have]
+    _extract(job.project, job.sift, missing, len(have))
 
 
-def extract_chunk(job: Job) -> None:
-    """Write the features of the job's chunk of photographs to a database of its own."""
-    new_database.create(Path(job.database), job, job.photographs)
-    _extract(job, list(job.photographs), 0)
+def extract_chunk(job: FeaturesChunk) -> None:
+    """Write the features of some photographs to a database of their own."""
+    new_database.create(job.project.database, job.project.photographs, job.positions)
+    _extract(job.project, job.sift, job.positions, 0)
 
 
-def _extract(job: Job, missing: list[int], have: int) -> None:
-    progress = ProgressWriter(job)
+def _extract(project: Project, sift: Sift, missing: Sequence[int], have: int) -> None:
+    progress = ProgressWriter(project.database)
     cv2.setNumThreads(1)  # one thread per photograph is faster than several
-    with pycolmap.Database.open(job.database) as database:
-        for done, (position, (keypoints, descriptors)) in enumerate(_features(job, missing), 1):
+    threads = _threads(project)
+    with (
+        pycolmap.Database.open(project.database) as database,
+        ThreadPoolExecutor(threads) as pool,
+    ):
+        results = pool.map(partial(_features_of, project.photographs, sift), missing)
+        for done, (position, (keypoints, rows)) in enumerate(zip(missing, results, strict=True), 1):
             database.write_keypoints(position + 1, keypoints)
-            plain = pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, descriptors)
-            database.write_descriptors(position + 1, plain)
+            descriptors = pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, rows)
+            database.write_descriptors(position + 1, descriptors)
             progress.write("extracting features", have + done, have + len(missing))
 
 
-def _features(job: Job, positions: list[int]) -> Iterator[tuple[int, Features]]:
-    """(position, features) of each photograph in order, from several threads."""
-    root = Path(job.images_root)
-
-    def of_photograph(position: int) -> Features:
-        mask = job.masks[position]
-        picture = root / job.names[position]
-        settings = job.max_features, job.peak_threshold
-        return sift_features(picture, *settings, root / mask if mask else None)
-
-    with ThreadPoolExecutor(_threads(job)) as pool:
-        yield from zip(positions, pool.map(of_photograph, positions), strict=True)
+def _features_of(photographs: Photographs, sift: Sift, position: int) -> KeypointsAndDescriptors:
+    mask = photographs.masks[position]
+    return sift_features(
+        photographs.folder / photographs.names[position],
+        sift.max_features,
+        sift.peak_threshold,
+        photographs.folder / mask if mask else None,
+    )
 
 
-def _threads(job: Job) -> int:
+def _threads(project: Project) -> int:
     """One per core, as long as their pictures fit in half of the free memory."""
-    pixels = max(math.prod(_reduced(camera.width, camera.height)) for camera in job.cameras)
+    cameras = project.photographs.cameras
+    pixels = max(math.prod(_reduced(camera.width, camera.height)) for camera in cameras)
     available_mib = memory.available_mib()
-    return max(1, int(min(job.threads, 0.5 * available_mib / (pixels * _PIXEL_BYTES / MIB))))
+    return max(1, int(min(project.threads, 0.5 * available_mib / (pixels * _PIXEL_BYTES / MIB))))
 
 
 def sift_features(
     photograph: Path, most: int, peak_threshold: float, mask: Path | None = None
-) -> Features:
+) -> KeypointsAndDescriptors:
     """(keypoints, descriptors) of a picture file, largest first, in COLMAP's conventions.
 
     keypoints [N, 4] float32: x, y (pixels, pixel centres at +0.5), scale (pixels), orientation

@@ -14,7 +14,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from stages.sfm.worker.job import Job, ProgressWriter
+from stages.sfm.worker.job import Project
+from stages.sfm.worker.progress import ProgressWriter
 
 LEAST_ANGLE_DEG = 8.0  # median angle at which the rays of the matches meet: half of COLMAP's
 MOST_FORWARD = 0.95  # share of the motion that is along the optical axis, as in COLMAP
@@ -22,20 +23,21 @@ _MOST_TRIALS = 500  # of RANSAC: nearly all of these matches are right
 
 
 def strongest_pair(
-    job: Job,
+    project: Project,
     database: pycolmap.Database,
     verified: Sequence[tuple[tuple[int, int], NDArray[np.integer]]],
 ) -> tuple[int, int] | None:
     """Image ids of the pair with most matches among those with enough parallax, or None. The faces
     of a panorama are no pair. verified: both image ids and the matches [N, 2] of each pair."""
     options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.random_seed, options.ransac.max_num_trials = job.seed, _MOST_TRIALS
+    options.ransac.random_seed, options.ransac.max_num_trials = project.seed, _MOST_TRIALS
     options.compute_relative_pose = True
-    progress = ProgressWriter(job)
+    progress = ProgressWriter(project.database)
+    frames = project.photographs.frames
     ordered = sorted(verified, key=lambda pair: (-len(pair[1]), pair[0]))
     for done, (both, matches) in enumerate(ordered, 1):
         progress.write("choosing the initial pair", done, len(ordered))
-        if job.frames[both[0] - 1] == job.frames[both[1] - 1]:
+        if frames[both[0] - 1] == frames[both[1] - 1]:
             continue
         first, second = (database.read_camera(database.read_image(i).camera_id) for i in both)
         a, b = (database.read_keypoints(i)[:, :2].astype(np.float64) for i in both)

@@ -1,23 +1,19 @@
-"""A job of the worker process: plain data, passed as JSON.
-
-Also: progress of the worker process, in a small file that its parent reads.
-"""
+"""Jobs of the worker process: one small message for each step, passed as JSON."""
 
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, is_dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stages.base import threads
 from stages.scene import Capture
+from stages.sfm.worker.pairs import Pair
 
 
 @dataclass(frozen=True)
@@ -38,87 +34,244 @@ class CameraGuess:
 
 
 @dataclass(frozen=True)
-class Job:
-    """One step of structure from motion for P photographs.
+class Photographs:
+    """P photographs in the capture's order, which fixes their image ids (position + 1).
 
     Args:
-        step: one of those in `worker`.
-        images_root: folder that `names` and `masks` are relative to.
-        database: COLMAP's database.
-        out: folder for the model of mapping (`sparse_model.save_model`).
-        names: [P] in the capture's order, which fixes the image ids (position + 1).
+        folder: that `names` and `masks` are relative to.
+        names: [P].
+        masks: [P] mask files, "" for none.
         camera_of: [P] index into `cameras`.
         frame_of: [P] number of each photograph's frame, from 0: the faces of a panorama share one.
         cameras: known intrinsics.
-        masks: [P] mask files, "" for none.
-        seed: of RANSAC and the mapper.
-        threads: how many to use.
-        max_features, peak_threshold: of SIFT (Lowe 2004).
-        matching: which pairs: "selected" by retrieval, "exhaustive" or "sequential".
-        drop_stationary: drop matches that stay in place in the picture (a date stamp).
-        loose: register photographs with fewer inliers.
-        strongest_start: start mapping from `initial_pair.strongest_pair`.
-        refine: refine the poses of known cameras.
-        max_seconds: time limit of mapping.
-        source: of a chunk: the database of the whole job; of "learned": that of SIFT.
-        photographs, pairs: of a chunk: the positions to process; of "learned": the
-            photographs to join; of known cameras: all pairs to match.
-        known: of known cameras, each of which has one photograph: intrinsics [P, 4] fx, fy, cx, cy;
-            world_to_camera [P, 4, 4]; rotations [P, 3, 3] from the axes of the frame to the
-            camera's.
     """
 
-    step: str
-    images_root: str
-    database: str
-    out: str
+    folder: Path
     names: tuple[str, ...]
+    masks: tuple[str, ...]
     camera_of: tuple[int, ...]
     frame_of: tuple[int, ...]
     cameras: tuple[CameraGuess, ...]
-    masks: tuple[str, ...]
-    seed: int = 0
-    threads: int = 1
-    max_features: int = 12288
-    peak_threshold: float = 0.0045
-    matching: str = "selected"
-    drop_stationary: bool = False
-    loose: bool = False
-    strongest_start: bool = False
-    refine: bool = False
-    max_seconds: int = 3600
-    source: str = ""
-    photographs: tuple[int, ...] = ()
-    pairs: tuple[tuple[int, int], ...] = ()
-    known: dict[str, list[Any]] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.names)
 
     @property
     def frames(self) -> NDArray[np.int64]:
         """[P] `frame_of` as an array."""
         return np.array(self.frame_of, np.int64)
 
+
+@dataclass(frozen=True)
+class Project:
+    """What all steps share.
+
+    Args:
+        database: COLMAP's database.
+        photographs: that are in it.
+        seed: of RANSAC and the mapper.
+        threads: how many to use.
+    """
+
+    database: Path
+    photographs: Photographs
+    seed: int = 0
+    threads: int = 1
+
+
+@dataclass(frozen=True)
+class Sift:
+    """Settings of SIFT (Lowe 2004).
+
+    Args:
+        max_features: of a photograph.
+        peak_threshold: of differences of blurred pictures, for white = 1.
+    """
+
+    max_features: int = 12288
+    peak_threshold: float = 0.0045
+
+
+@dataclass(frozen=True)
+class KnownCameras:
+    """Known cameras, each of one photograph.
+
+    Args:
+        intrinsics: [P, 4] fx, fy, cx, cy.
+        world_to_camera: [P, 4, 4].
+        rotations: [P, 3, 3] from the axes of the frame to the camera's.
+    """
+
+    intrinsics: NDArray[np.float64]
+    world_to_camera: NDArray[np.float64]
+    rotations: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Job:
+    """One step for one project; a subclass adds what its step needs."""
+
+    step: ClassVar[str]
+    project: Project
+
     def write(self, path: Path) -> Path:
-        path.write_text(json.dumps(asdict(self)), encoding="utf-8")
+        path.write_text(_encoded({"step": self.step, "job": self}), encoding="utf-8")
         return path
 
-    @classmethod
-    def read(cls, path: Path) -> Job:
+    @staticmethod
+    def read(path: Path) -> Any:
+        """The job that `write` wrote, of its own class."""
         stored = json.loads(path.read_text(encoding="utf-8"))
-        data: dict[str, Any] = {
-            name: tuple(value) if isinstance(value, list) else value
-            for name, value in stored.items()
-        }
-        data["pairs"] = tuple((first, second) for first, second in data["pairs"])
-        cameras = (camera | {"turn": tuple(camera["turn"])} for camera in data["cameras"])
-        data["cameras"] = tuple(CameraGuess(**camera) for camera in cameras)
-        return cls(**data)
+        return _decoded(KINDS[stored["step"]], stored["job"])
 
 
-def job_of(capture: Capture, work: Path, seed: int, max_features: int, matching: str) -> Job:
-    """The job of the standard configuration: photographs of the same key and size share a camera.
+@dataclass(frozen=True)
+class Features(Job):
+    """Extract the features of all photographs."""
 
-    matching: "auto", "exhaustive" or "sequential". See `Job` for the rest.
+    step = "features"
+    sift: Sift
+
+
+@dataclass(frozen=True)
+class FeaturesChunk(Job):
+    """Extract the features of the photographs at `positions`, into the project's database, which is
+    new."""
+
+    step = "features chunk"
+    sift: Sift
+    positions: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Matching(Job):
+    """Match and verify pairs.
+
+    Args:
+        how: "auto" (pairs that look alike), "exhaustive" or "sequential".
+        drop_stationary: drop matches that stay in place in the picture (a date stamp).
     """
+
+    step = "matching"
+    how: str
+    drop_stationary: bool = False
+
+
+@dataclass(frozen=True)
+class PairSelection(Job):
+    """Merge finished chunks and select the pairs to match next. how: as in `Matching`."""
+
+    step = "pair selection"
+    how: str
+
+
+@dataclass(frozen=True)
+class MatchingChunk(Job):
+    """Match and verify some pairs, into the project's database, which is new.
+
+    Args:
+        source: the database with the features.
+        pairs: of positions.
+        drop_stationary: as in `Matching`.
+    """
+
+    step = "matching chunk"
+    source: Path
+    pairs: tuple[Pair, ...]
+    drop_stationary: bool
+
+
+@dataclass(frozen=True)
+class Learned(Job):
+    """Copy a database with SIFT's matches, and add learned features and their matches.
+
+    Args:
+        source: the database with SIFT's matches.
+        positions: of the photographs to join to the others.
+    """
+
+    step = "learned"
+    source: Path
+    positions: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Mapping(Job):
+    """Find camera poses and points.
+
+    Args:
+        out: folder for the model (`sparse_model.save_model`).
+        max_seconds: time limit.
+        loose: register photographs with fewer inliers.
+        strongest_start: start from `initial_pair.strongest_pair`.
+    """
+
+    step = "mapping"
+    out: Path
+    max_seconds: int
+    loose: bool = False
+    strongest_start: bool = False
+
+
+@dataclass(frozen=True)
+class Neighbours(Job):
+    """Match and verify `pairs` of photographs with known intrinsics [P, 4] (fx, fy, cx, cy)."""
+
+    step = "neighbours"
+    intrinsics: NDArray[np.float64]
+    pairs: tuple[Pair, ...]
+
+
+@dataclass(frozen=True)
+class Triangulation(Job):
+    """Check known poses against the matches, and triangulate points.
+
+    Args:
+        out: folder for the result.
+        cameras: known cameras.
+        refine: refine their poses.
+    """
+
+    step = "triangulation"
+    out: Path
+    cameras: KnownCameras
+    refine: bool
+
+
+KINDS: dict[str, type[Job]] = {
+    kind.step: kind
+    for kind in (
+        *(Features, FeaturesChunk, Matching, PairSelection, MatchingChunk, Learned, Mapping),
+        *(Neighbours, Triangulation),
+    )
+}
+
+
+def _encoded(value: object) -> str:
+    """As JSON."""
+
+    def plain(part: Any) -> Any:
+        if isinstance(part, np.ndarray):
+            return part.tolist()
+        return str(part) if isinstance(part, Path) else vars(part)
+
+    return json.dumps(value, default=plain, sort_keys=True)
+
+
+def _decoded(kind: Any, value: Any) -> Any:
+    """A value of JSON as an object of type `kind`."""
+    if isinstance(kind, type) and is_dataclass(kind):
+        kinds = get_type_hints(kind)
+        return kind(**{name: _decoded(kinds[name], part) for name, part in value.items()})
+    if get_origin(kind) is tuple:
+        return tuple(_decoded(get_args(kind)[0], part) for part in value)
+    if get_origin(kind) is np.ndarray:
+        return np.array(value, np.float64)
+    return Path(value) if kind is Path else value
+
+
+def project_of(capture: Capture, work: Path, seed: int) -> Project:
+    """The project of a capture. Photographs of the same key and size share a camera."""
     positions: dict[tuple[str, int, int], int] = {}
     guesses: list[CameraGuess] = []
     camera_of = []
@@ -131,29 +284,25 @@ def job_of(capture: Capture, work: Path, seed: int, max_features: int, matching:
         camera_of.append(positions[key])
     sources = list(dict.fromkeys(photo.source for photo in capture.photos))
     frame = {source: number for number, source in enumerate(sources)}
-    return Job(
-        step="",
-        images_root=str(capture.folder.resolve()),
-        database=str(work / "base.db"),
-        out="",
+    photographs = Photographs(
+        folder=capture.folder.resolve(),
         names=tuple(photo.image for photo in capture.photos),
         masks=tuple(photo.mask for photo in capture.photos),
         camera_of=tuple(camera_of),
         frame_of=tuple(frame[photo.source] for photo in capture.photos),
         cameras=tuple(guesses),
-        seed=seed,
-        threads=threads.count(),
-        max_features=max_features,
-        matching="selected" if matching == "auto" else matching,
     )
+    return Project(work / "base.db", photographs, seed, threads.count())
 
 
-def prepare_work_folder(work: Path, job: Job) -> None:
-    """Keep what an interrupted run left in `work` if it was the same job; clear it otherwise."""
+def prepare_work_folder(work: Path, project: Project, *settings: object) -> None:
+    """Keep what an interrupted run left in `work` if its project and settings were the same; clear
+    the folder otherwise."""
     description = work / "description.json"
     # Locations and the number of threads change no result.
-    same = {"images_root": "", "database": "", "out": "", "threads": 0}
-    wanted = json.dumps(asdict(job) | same, sort_keys=True)
+    photographs = replace(project.photographs, folder=Path())
+    same = replace(project, database=Path(), photographs=photographs, threads=0)
+    wanted = _encoded([same, *settings])
     try:
         unchanged = description.read_text(encoding="utf-8") == wanted
     except (OSError, ValueError):
@@ -164,57 +313,21 @@ def prepare_work_folder(work: Path, job: Job) -> None:
         description.write_text(wanted, encoding="utf-8")
 
 
-def similarity_path(job: Job) -> Path:
+def similarity_path(database: Path) -> Path:
     """File with the matches that pair selection found: similarity [P, P]."""
-    return Path(job.database).with_suffix(".similarity.npz")
+    return database.with_suffix(".similarity.npz")
 
 
-def vocabulary_path(job: Job) -> Path:
-    """File with the vocabulary of the whole job: [W, 128]."""
-    return Path(job.source or job.database).with_suffix(".vocabulary.npy")
+def vocabulary_path(database: Path) -> Path:
+    """File with the vocabulary of the features in `database`: [W, 128]."""
+    return database.with_suffix(".vocabulary.npy")
 
 
-def selected_pairs_path(job: Job) -> Path:
+def selected_pairs_path(database: Path) -> Path:
     """File with the pairs that the step "pair selection" selected to match next, as JSON."""
-    return Path(job.database).with_suffix(".pairs.json")
+    return database.with_suffix(".pairs.json")
 
 
-def chunks_path(job: Job) -> Path:
-    """Folder for finished chunks of the job."""
-    return Path(job.database).with_suffix(".chunks")
-
-
-def progress_path(job: Job) -> Path:
-    """File with the worker's progress (`ProgressWriter`)."""
-    return Path(job.database).with_name("progress.json")
-
-
-_SECONDS = 0.2  # between two writes
-
-
-class ProgressWriter:
-    """Writes `progress_path`."""
-
-    def __init__(self, job: Job) -> None:
-        self._path = progress_path(job)
-        self._next = 0.0
-
-    def write(self, phase: str, done: int, total: int) -> None:
-        """Record that `done` of `total` units of `phase` are finished; at most every 0.2 s, and
-        always at the end."""
-        now = time.monotonic()
-        if now < self._next and done < total:
-            return
-        self._next = now + _SECONDS
-        partial = self._path.with_name(self._path.name + ".partial")
-        partial.write_text(json.dumps([phase, done, total]))
-        os.replace(partial, self._path)
-
-
-def read_progress(job: Job) -> tuple[str, int, int] | None:
-    """(phase, done, total) as last written; None before the first time."""
-    try:
-        phase, done, total = json.loads(progress_path(job).read_text())
-        return str(phase), int(done), int(total)
-    except (OSError, ValueError, TypeError):
-        return None
+def chunks_path(database: Path) -> Path:
+    """Folder for finished chunks, which are merged into `database`."""
+    return database.with_suffix(".chunks")

@@ -5,17 +5,15 @@ from __future__ import annotations
 import itertools
 import shutil
 import time
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
-from stages.sfm.known.epipolar import MatchedPair, epipolar_distances, inlier_ratios
 from stages.sfm.worker.initial_pair import LEAST_ANGLE_DEG, strongest_pair
-from stages.sfm.worker.job import Job, ProgressWriter
+from stages.sfm.worker.job import Mapping, Project
+from stages.sfm.worker.pair_checks import pair_arrays, pose_matrix, verified_matches
+from stages.sfm.worker.progress import ProgressWriter
 from stages.sfm.worker.sparse_model import SparseModel, save_model
 
 # A smaller model is compared with the largest one only if it has this many photographs, this share
@@ -24,21 +22,13 @@ CREDIBLE_VIEWS, CREDIBLE_SHARE, CREDIBLE_POINTS = 4, 0.1, 20
 SMALLEST_MODEL = 3  # photographs; COLMAP's default of 10 would hide a small second scene
 MOST_MODELS = 8
 LOOSE_INLIERS = 15
-PAIR_INLIERS = 30  # pairs with fewer may match by chance and are not held against a model
-# An object that was turned before a background that stands still: between photographs before and
-# after it, the matches that do not fit the model fit another rotation, the same one in all pairs.
-MISFIT_DISTANCE = 0.01  # of the longer side
-TURNED_DEG, SAME_TURN_DEG = 20.0, 15.0
-FEWEST_TURNED = 5  # pairs; repeated windows around a courtyard gave 3
 ROBUST_ADJUSTMENT_ITERATIONS = 25
 _LEAST_NOISE = 0.05  # px
 
 
-def map_photographs(job: Job) -> None:
+def map_photographs(job: Mapping) -> None:
     """Write the largest model, and the names in each model found, to the folder `job.out`."""
-    out = Path(job.out)
-    if not out.name:  # "" would be the working directory
-        raise ValueError("the job names no folder to leave its model in")
+    out = job.out
     shutil.rmtree(out, ignore_errors=True)
     scratch = out.with_name(out.name + "-colmap")
     shutil.rmtree(scratch, ignore_errors=True)
@@ -52,16 +42,16 @@ def map_photographs(job: Job) -> None:
     )
     if ordered:
         _robust_bundle_adjustment(ordered[0])
-    groups = [_one_name_a_frame(m, job) for m in ordered]
-    model = _sparse_model(ordered[0], ordered[1:], job) if ordered else None
+    groups = [_one_name_a_frame(m, job.project) for m in ordered]
+    model = _sparse_model(ordered[0], ordered[1:], job.project) if ordered else None
     save_model(out, model, groups=groups, timed_out=timed_out)
     shutil.rmtree(scratch, ignore_errors=True)
 
 
-def _one_name_a_frame(model: pycolmap.Reconstruction, job: Job) -> list[str]:
+def _one_name_a_frame(model: pycolmap.Reconstruction, project: Project) -> list[str]:
     """Names of registered photographs; of each panorama, that of one face."""
-    ids = sorted(model.reg_image_ids(), reverse=True)
-    return sorted({int(job.frames[i - 1]): model.images[i].name for i in ids}.values())
+    ids, frame_of = sorted(model.reg_image_ids(), reverse=True), project.photographs.frame_of
+    return sorted({frame_of[i - 1]: model.images[i].name for i in ids}.values())
 
 
 def _robust_bundle_adjustment(model: pycolmap.Reconstruction) -> None:
@@ -85,14 +75,41 @@ def _robust_bundle_adjustment(model: pycolmap.Reconstruction) -> None:
     model.update_point_3d_errors()
 
 
-def _incremental(job: Job, scratch: Path) -> dict[int, pycolmap.Reconstruction]:
+def _incremental(job: Mapping, scratch: Path) -> dict[int, pycolmap.Reconstruction]:
+    project, photographs = job.project, job.project.photographs
+    registered = itertools.count(1)
+    progress = ProgressWriter(project.database)
+
+    def new_model() -> None:
+        nonlocal registered
+        registered = itertools.count(2)
+        one_more()
+
+    def one_more() -> None:
+        frames = max(photographs.frame_of) + 1
+        progress.write("registering photographs", next(registered), frames)
+
+    return dict(
+        pycolmap.incremental_mapping(
+            project.database,
+            photographs.folder,
+            scratch,
+            _options(job),
+            initial_image_pair_callback=new_model,
+            next_image_callback=one_more,
+        )
+    )
+
+
+def _options(job: Mapping) -> pycolmap.IncrementalPipelineOptions:
+    project, photographs = job.project, job.project.photographs
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = 1  # more threads sum residuals in another order each time
-    options.random_seed = options.mapper.random_seed = job.seed
-    options.triangulation.random_seed = job.seed
+    options.random_seed = options.mapper.random_seed = project.seed
+    options.triangulation.random_seed = project.seed
     options.mapper.num_threads = 1
     # COLMAP counts images, of which a panorama is twelve: two in common would end a second model.
-    images = np.bincount(job.frames)
+    images = np.bincount(photographs.frames)
     options.min_model_size = SMALLEST_MODEL * int(images.min())
     options.max_model_overlap *= int(images.max())
     options.max_num_models = MOST_MODELS
@@ -105,7 +122,7 @@ def _incremental(job: Job, scratch: Path) -> dict[int, pycolmap.Reconstruction]:
     options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.2
     options.ba_global_function_tolerance = 1e-4
     options.ba_refine_sensor_from_rig = False  # the faces of a panorama lie exactly
-    exact = [number for number, camera in enumerate(job.cameras, 1) if camera.rig]
+    exact = [number for number, camera in enumerate(photographs.cameras, 1) if camera.rig]
     options.constant_cameras = options.mapper.constant_cameras = set(exact)
     if job.loose:
         options.mapper.abs_pose_min_num_inliers = LOOSE_INLIERS
@@ -113,35 +130,17 @@ def _incremental(job: Job, scratch: Path) -> dict[int, pycolmap.Reconstruction]:
         options.mapper.init_min_num_inliers = 50
         options.mapper.init_min_tri_angle = 8.0
     if job.strongest_start:
-        _start_from_strongest_pair(options, job)
-    registered = itertools.count(1)
-    progress = ProgressWriter(job)
-
-    def new_model() -> None:
-        nonlocal registered
-        registered = itertools.count(2)
-        one_more()
-
-    def one_more() -> None:
-        progress.write("registering photographs", next(registered), int(job.frames.max()) + 1)
-
-    return dict(
-        pycolmap.incremental_mapping(
-            job.database,
-            job.images_root,
-            scratch,
-            options,
-            initial_image_pair_callback=new_model,
-            next_image_callback=one_more,
-        )
-    )
+        _start_from_strongest_pair(options, project)
+    return options
 
 
-def _start_from_strongest_pair(options: pycolmap.IncrementalPipelineOptions, job: Job) -> None:
+def _start_from_strongest_pair(
+    options: pycolmap.IncrementalPipelineOptions, project: Project
+) -> None:
     """Start from `initial_pair.strongest_pair`, and make one model: a second one would start from
     the same pair."""
-    with pycolmap.Database.open(job.database) as database:
-        pair = strongest_pair(job, database, verified_matches(database))
+    with pycolmap.Database.open(project.database) as database:
+        pair = strongest_pair(project, database, verified_matches(database))
     if pair is not None:
         options.init_image_id1, options.init_image_id2 = pair
         options.mapper.init_min_tri_angle = LEAST_ANGLE_DEG / 2  # COLMAP measures it otherwise
@@ -149,21 +148,21 @@ def _start_from_strongest_pair(options: pycolmap.IncrementalPipelineOptions, job
 
 
 def _sparse_model(
-    model: pycolmap.Reconstruction, others: list[pycolmap.Reconstruction], job: Job
+    model: pycolmap.Reconstruction, others: list[pycolmap.Reconstruction], project: Project
 ) -> SparseModel:
     """COLMAP's model as arrays, cameras, photographs and points in order of their ids.
 
     Args:
         model: the largest model.
         others: the smaller models.
-        job: the job that both come from.
+        project: that both come from.
     """
-    image_ids = sorted(model.reg_image_ids())
+    image_ids, photographs = sorted(model.reg_image_ids()), project.photographs
     position = {image_id: i for i, image_id in enumerate(image_ids)}
     rotations = [_rotation_between(model, other) for other in others if _credible(other, model)]
     cameras = [
         model.cameras[camera_id + 1]
-        for camera_id in range(len(job.cameras))
+        for camera_id in range(len(photographs.cameras))
         if camera_id + 1 in model.cameras
     ]
     camera_position = {camera.camera_id: i for i, camera in enumerate(cameras)}
@@ -172,15 +171,15 @@ def _sparse_model(
         view_cameras=np.array(
             [camera_position[model.images[i].camera_id] for i in image_ids], np.int32
         ),
-        view_frames=job.frames[np.array(image_ids) - 1].astype(np.int32),
-        world_to_camera=np.array([_matrix(model.images[i].cam_from_world()) for i in image_ids]),
+        view_frames=photographs.frames[np.array(image_ids) - 1].astype(np.int32),
+        world_to_camera=np.array([pose_matrix(model.images[i]) for i in image_ids]),
         camera_sizes=np.array([(c.width, c.height) for c in cameras], np.int32).reshape(-1, 2),
         camera_params=np.array([c.params for c in cameras], np.float64).reshape(-1, 4),
         focal_priors_px=np.array(
-            [job.cameras[c.camera_id - 1].focal_px or np.nan for c in cameras], np.float64
+            [photographs.cameras[c.camera_id - 1].focal_px or np.nan for c in cameras], np.float64
         ),
         **point_arrays(model, position),
-        **_pair_inlier_ratios(job, model, position),
+        **pair_arrays(project, model, position),
         rotations_to_others_deg=np.array([r for r in rotations if r is not None], np.float64),
     )
 
@@ -208,12 +207,6 @@ def _rotation_between(
     return float(np.degrees(np.arccos(np.clip(min(cosines), -1.0, 1.0)))) if cosines else None
 
 
-def _matrix(pose: Any) -> np.ndarray:
-    matrix = np.eye(4)
-    matrix[:3] = pose.matrix()
-    return matrix
-
-
 def point_arrays(model: pycolmap.Reconstruction, position: dict[int, int]) -> dict[str, np.ndarray]:
     """points, colours, observed_points, observing_views and observed_px as in `SparseModel`, points
     in order of their ids. position: index of each registered photograph by image id."""
@@ -233,100 +226,3 @@ def point_arrays(model: pycolmap.Reconstruction, position: dict[int, int]) -> di
         "observing_views": table[:, 1].astype(np.int32),
         "observed_px": table[:, 2:],
     }
-
-
-def verified_matches(
-    database: pycolmap.Database,
-) -> list[tuple[tuple[int, int], NDArray[np.integer]]]:
-    """(both image ids, keypoints that match [N, 2]) of each pair with enough matches that two-view
-    geometry verified."""
-    found = [
-        (pycolmap.pair_id_to_image_pair(pair_id), np.asarray(geometry.inlier_matches))
-        for pair_id, geometry in zip(*database.read_two_view_geometries(), strict=True)
-    ]
-    return [(both, inliers) for both, inliers in found if len(inliers) >= PAIR_INLIERS]
-
-
-def _pair_inlier_ratios(
-    job: Job, model: pycolmap.Reconstruction, position: dict[int, int]
-) -> dict[str, np.ndarray]:
-    """`pairs`, `pair_inlier_ratios` and `pairs_turned` of `SparseModel`, of the matches that
-    two-view geometry verified."""
-    progress = ProgressWriter(job)
-    normalised: dict[int, np.ndarray] = {}  # undistorted pixels, relative to the principal point
-    focal = {i: model.cameras[model.images[i].camera_id].mean_focal_length() for i in position}
-    intrinsics = np.array([(focal[i], focal[i], 0.0, 0.0) for i in position])
-    poses = np.array([_matrix(model.images[i].cam_from_world()) for i in position])
-    side = max(max(c.width, c.height) for c in model.cameras.values())
-    pairs, ratios, turns = [], [], []
-    with pycolmap.Database.open(job.database) as database:
-        verified = verified_matches(database)
-        for done, (both, inliers) in enumerate(verified, 1):
-            progress.write("checking pairs", done, len(verified))
-            if any(image not in position for image in both):
-                continue
-            for image in both:
-                if image not in normalised:
-                    camera = model.cameras[model.images[image].camera_id]
-                    pixels = database.read_keypoints(image)[:, :2].astype(np.float64)
-                    normalised[image] = focal[image] * np.asarray(camera.cam_from_img(pixels))
-            pairs.append((position[both[0]], position[both[1]]))
-            a, b = (normalised[image][inliers[:, k]] for k, image in enumerate(both))
-            ratios += inlier_ratios([(*pairs[-1], a, b)], intrinsics, poses, side).tolist()
-            matches = database.read_matches(*both)
-            a, b = (normalised[image][matches[:, k]] for k, image in enumerate(both))
-            turns.append(_turn((*pairs[-1], a, b), intrinsics, poses, side, job.seed))
-    found = np.nan_to_num(np.array(ratios, np.float64), nan=1.0)
-    turned = np.zeros(len(pairs), np.bool_)
-    turned[_turned_pairs(turns)] = True
-    checked = np.array(pairs, np.int32).reshape(-1, 2)
-    return {"pairs": checked, "pair_inlier_ratios": found, "pairs_turned": turned}
-
-
-def _turn(
-    pair: MatchedPair,
-    intrinsics: NDArray[np.float64],
-    poses: NDArray[np.float64],
-    side: float,
-    seed: int,
-) -> NDArray[np.float64] | None:
-    """[3, 3] the rotation of the world between two photographs that those matches show which do not
-    fit the model; None if they show none, or hardly any. Arguments as in `epipolar`."""
-    away = epipolar_distances(pair, intrinsics, poses)
-    if away is None:
-        return None
-    misfit = away > MISFIT_DISTANCE * side
-    (first, second), (a, b) = pair[:2], (px[misfit] for px in pair[2:])
-    if len(a) < PAIR_INLIERS:
-        return None
-    options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.random_seed, options.ransac.max_num_trials = seed, 1000
-    options.compute_relative_pose = True
-    left, right = (
-        pycolmap.Camera(model="PINHOLE", width=1, height=1, params=intrinsics[i])
-        for i in (first, second)
-    )
-    order = np.repeat(np.arange(len(a), dtype=np.uint32)[:, None], 2, axis=1)
-    found = pycolmap.estimate_two_view_geometry(left, a, right, b, order, options)
-    if len(found.inlier_matches) < PAIR_INLIERS or found.cam2_from_cam1 is None:
-        return None
-    relative = found.cam2_from_cam1.rotation.matrix()
-    turn = poses[second, :3, :3].T @ relative @ poses[first, :3, :3]
-    small = np.trace(turn) > 1.0 + 2.0 * np.cos(np.radians(TURNED_DEG))
-    return None if small else np.asarray(turn, np.float64)
-
-
-def _turned_pairs(turns: Sequence[NDArray[np.float64] | None]) -> list[int]:
-    """Positions of the pairs that agree on one turn, or its inverse: as many as there are, and none
-    if these are fewer than `FEWEST_TURNED`."""
-    known = [i for i, turn in enumerate(turns) if turn is not None]
-    if len(known) < FEWEST_TURNED:
-        return []
-    all_turns = np.array([turns[i] for i in known])
-    traces = np.maximum(
-        np.einsum("aij,bij->ab", all_turns, all_turns),
-        np.einsum("aij,bji->ab", all_turns, all_turns),
-    )
-    agree = traces > 1.0 + 2.0 * np.cos(np.radians(SAME_TURN_DEG))
-    best = np.flatnonzero(agree[agree.sum(axis=1).argmax()])
-    return [known[i] for i in best] if len(best) >= FEWEST_TURNED else []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -18,14 +18,17 @@ from stages.sfm.worker import database as sqlite
 from stages.sfm.worker import new_database, pairs, retrieval
 from stages.sfm.worker.descriptor_matching import match_descriptors
 from stages.sfm.worker.job import (
-    Job,
-    ProgressWriter,
+    Matching,
+    MatchingChunk,
+    PairSelection,
+    Project,
     chunks_path,
     selected_pairs_path,
     similarity_path,
     vocabulary_path,
 )
 from stages.sfm.worker.pairs import Pair
+from stages.sfm.worker.progress import ProgressWriter
 from stages.sfm.worker.vocabulary import (
     SAMPLED_DESCRIPTORS,
     FeatureIndex,
@@ -41,67 +44,79 @@ MOST_TRIALS = 3000  # of RANSAC, for pairs with few inliers
 _CACHED = 256  # photographs whose feature indices stay in memory
 
 
-def match_all(job: Job) -> None:
+def match_all(job: Matching) -> None:
     """Match and verify pairs of photographs, except those that the database holds."""
-    with _matcher(job, job.database) as matcher:
-        for wanted in _rounds(job, matcher.features, matcher.inliers):
+    with _matcher(job.project, job.drop_stationary) as matcher:
+        for wanted in _rounds(job.project, job.how, matcher.features, matcher.inliers):
             matcher.run(wanted)
 
 
-def match_pairs(job: Job, wanted: list[Pair]) -> None:
+def match_pairs(project: Project, wanted: Sequence[Pair]) -> None:
     """Match and verify the `wanted` pairs, except those that the database holds."""
-    with _matcher(job, job.database) as matcher:
+    with _matcher(project) as matcher:
         matcher.run(wanted)
 
 
-def select_pairs(job: Job) -> None:
+def select_pairs(job: PairSelection) -> None:
     """Merge finished chunks, and write the pairs to match next (`selected_pairs_path`): none once
     `match_all` would find nothing to do."""
-    database = Path(job.database)
-    sqlite.merge_chunks(database, sorted(chunks_path(job).glob("*.db")))
+    database = job.project.database
+    sqlite.merge_chunks(database, sorted(chunks_path(database).glob("*.db")))
     inliers = sqlite.inliers_of_pairs(database)
     missing: list[Pair] = []
     with closing(sqlite.StoredFeatures(database)) as stored:
-        features = _IndexedFeatures(job, stored)
+        features = _IndexedFeatures(job.project, stored, database)
         features.vocabulary()  # built once, and not in each chunk
-        for wanted in _rounds(job, features, inliers):
+        for wanted in _rounds(job.project, job.how, features, inliers):
             missing = [pair for pair in wanted if pair not in inliers]
             if missing:
                 break
-    selected_pairs_path(job).write_text(json.dumps(missing))
+    selected_pairs_path(database).write_text(json.dumps(missing))
 
 
-def match_chunk(job: Job) -> None:
-    """Match and verify the pairs of the job's chunk, into a database of its own."""
-    new_database.create(Path(job.database), job, ())
-    with _matcher(job, job.source, immutable=True) as matcher:
-        matcher.run(list(job.pairs))
+def match_chunk(job: MatchingChunk) -> None:
+    """Match and verify some pairs, into a database of their own."""
+    new_database.create(job.project.database, job.project.photographs, ())
+    with _matcher(job.project, job.drop_stationary, job.source) as matcher:
+        matcher.run(job.pairs)
 
 
 @contextmanager
-def _matcher(job: Job, source: str, immutable: bool = False) -> Iterator[_Matcher]:
-    """A matcher with features from the database `source`; immutable: as in
-    `database.StoredFeatures`. Its reader is closed before the writer, because the last to close a
-    database tidies it up."""
+def _matcher(
+    project: Project, drop_stationary: bool = False, source: Path | None = None
+) -> Iterator[_Matcher]:
+    """A matcher. Its reader is closed before its writer, because the last to close a database
+    tidies it up.
+
+    source: another database to read features from, which nothing writes to meanwhile.
+    """
+    path = source or project.database
     with (
-        pycolmap.Database.open(job.database) as database,
-        closing(sqlite.StoredFeatures(Path(source), immutable)) as stored,
+        pycolmap.Database.open(project.database) as database,
+        closing(sqlite.StoredFeatures(path, immutable=source is not None)) as stored,
     ):
-        yield _Matcher(job, database, stored)
+        features = _IndexedFeatures(project, stored, path)
+        yield _Matcher(project, database, features, drop_stationary)
 
 
 def _rounds(
-    job: Job, features: _IndexedFeatures, inliers: Mapping[Pair, int]
+    project: Project, how: str, features: _IndexedFeatures, inliers: Mapping[Pair, int]
 ) -> Iterator[list[Pair]]:
-    """Lists of pairs to match, each selected when the one before is matched. inliers: of the pairs
-    that are matched."""
-    frames = job.frames
-    if job.matching == "exhaustive":
+    """Lists of pairs to match, each selected when the one before is matched.
+
+    Args:
+        project: with the photographs.
+        how: as in `job.Matching`.
+        features: of the photographs.
+        inliers: of the pairs that are matched.
+    """
+    frames = project.photographs.frames
+    if how == "exhaustive":
         yield pairs.pairs_of_faces(pairs.exhaustive_pairs(int(frames.max()) + 1), frames)
-    elif job.matching == "sequential":
+    elif how == "sequential":
         yield pairs.pairs_of_faces(pairs.sequential_pairs(int(frames.max()) + 1), frames)
     else:
-        similarity = _similarity(job, features)
+        similarity = _similarity(project, features)
         first = [(i, j) for i, j in pairs.initial_pairs(similarity) if frames[i] != frames[j]]
         yield first
         known = {pair: inliers[pair] for pair in first}
@@ -109,23 +124,26 @@ def _rounds(
 
 
 class _IndexedFeatures:
-    """Features of photographs by position, indexed by visual word; for several threads."""
+    """Features of photographs by position, indexed by visual word; for several threads.
 
-    def __init__(self, job: Job, stored: sqlite.StoredFeatures) -> None:
-        self._job, self._stored = job, stored
+    stored, source: the features, and the database that they are in.
+    """
+
+    def __init__(self, project: Project, stored: sqlite.StoredFeatures, source: Path) -> None:
+        self._project, self._source, self.stored = project, source, stored
         self.vocabulary = functools.cache(self._vocabulary)
         self.index = functools.lru_cache(_CACHED)(self._index)
         self.points = functools.lru_cache(_CACHED)(stored.points)
 
     def _vocabulary(self) -> NDArray[np.float32]:
         """Of all photographs; stored beside the database, for chunks and resumed runs."""
-        path, photographs = vocabulary_path(self._job), len(self._job.names)
+        path, photographs = vocabulary_path(self._source), len(self._project.photographs)
         if not path.exists():
-            progress = ProgressWriter(self._job)
+            progress = ProgressWriter(self._project.database)
             most = max(1, SAMPLED_DESCRIPTORS // photographs)
             rows = []
             for i in range(photographs):
-                descriptors = self._stored.descriptors(i)
+                descriptors = self.stored.descriptors(i)
                 rows.append(descriptors[:: max(1, len(descriptors) // most)][:most])
                 progress.write("indexing features", i + 1, 2 * photographs)
             with replacing(path) as partial:
@@ -135,11 +153,11 @@ class _IndexedFeatures:
 
     def largest(self, position: int) -> tuple[FeatureIndex, NDArray[np.int64]]:
         """For pair selection: the largest features, and their words for retrieval."""
-        first, words = self._stored.descriptors(position)[:LARGEST_FEATURES], self.vocabulary()
+        first, words = self.stored.descriptors(position)[:LARGEST_FEATURES], self.vocabulary()
         return index_by_word(first, words, FEWEST_COMPARED_SMALL), word_pairs(first, words)
 
     def _index(self, position: int) -> FeatureIndex:
-        return index_by_word(self._stored.descriptors(position), self.vocabulary())
+        return index_by_word(self.stored.descriptors(position), self.vocabulary())
 
 
 class _Matcher:
@@ -147,20 +165,25 @@ class _Matcher:
     that are matched."""
 
     def __init__(
-        self, job: Job, database: pycolmap.Database, stored: sqlite.StoredFeatures
+        self,
+        project: Project,
+        database: pycolmap.Database,
+        features: _IndexedFeatures,
+        drop_stationary: bool,
     ) -> None:
-        self.features = _IndexedFeatures(job, stored)
-        self.inliers = sqlite.inliers_of_pairs(Path(job.database))
-        self._job, self._database, self._stored = job, database, stored
-        self._cameras = [database.read_camera(camera + 1) for camera in job.camera_of]
-        self._progress = ProgressWriter(job)
+        self.features = features
+        self.inliers = sqlite.inliers_of_pairs(project.database)
+        self._project, self._database = project, database
+        self._drop_stationary = drop_stationary
+        self._cameras = cameras_of(project, database)
+        self._progress = ProgressWriter(project.database)
 
-    def run(self, wanted: list[Pair]) -> None:
+    def run(self, wanted: Sequence[Pair]) -> None:
         """Match the `wanted` pairs, except those that are matched."""
         missing = [pair for pair in wanted if pair not in self.inliers]
         done = len(wanted) - len(missing)
         self.features.vocabulary()  # now, and not in several threads at once
-        with ThreadPoolExecutor(self._job.threads) as pool:
+        with ThreadPoolExecutor(self._project.threads) as pool:
             for pair, (matches, geometry) in zip(
                 missing, pool.map(self._match, missing), strict=True
             ):
@@ -176,27 +199,34 @@ class _Matcher:
         """(matches; None if the database has them, two-view geometry; without inliers if it has too
         few)."""
         first, second = pair
-        known = self._stored.matches(first, second)
+        known = self.features.stored.matches(first, second)
         matches = known
         if matches is None:
             matches = match_descriptors(self.features.index(first), self.features.index(second))
         sides = [(self._cameras[position], self.features.points(position)) for position in pair]
-        geometry = two_view_geometry(sides[0], sides[1], matches, self._job)
+        geometry = two_view_geometry(
+            sides[0], sides[1], matches, self._project.seed, self._drop_stationary
+        )
         return (matches if known is None else None), geometry
 
 
-def _similarity(job: Job, features: _IndexedFeatures) -> NDArray[np.int32]:
+def cameras_of(project: Project, database: pycolmap.Database) -> list[pycolmap.Camera]:
+    """[P] the camera of each photograph."""
+    return [database.read_camera(camera + 1) for camera in project.photographs.camera_of]
+
+
+def _similarity(project: Project, features: _IndexedFeatures) -> NDArray[np.int32]:
     """[P, P] matches among the largest features of the pairs that retrieval proposes; 0 for others.
     Stored for resumed runs."""
-    photographs, stored = len(job.names), similarity_path(job)
+    photographs, stored = len(project.photographs), similarity_path(project.database)
     if stored.exists():
         found: NDArray[np.int32] = np.load(stored)["similarity"]
         return found
     features.vocabulary()
-    progress = ProgressWriter(job)
+    progress = ProgressWriter(project.database)
     similarity = np.zeros((photographs, photographs), np.int32)
     indices, words_of = [], []
-    with ThreadPoolExecutor(job.threads) as pool:
+    with ThreadPoolExecutor(project.threads) as pool:
         for done, (index, words) in enumerate(pool.map(features.largest, range(photographs)), 1):
             indices.append(index)
             words_of.append(words)
@@ -204,7 +234,8 @@ def _similarity(job: Job, features: _IndexedFeatures) -> NDArray[np.int32]:
         wanted = retrieval.candidate_pairs(
             words_of, lambda done: progress.write("retrieving pairs", done, photographs)
         )
-        wanted = [(i, j) for i, j in wanted if job.frames[i] != job.frames[j]]
+        frames = project.photographs.frames
+        wanted = [(i, j) for i, j in wanted if frames[i] != frames[j]]
 
         def count_matches(pair: Pair) -> int:
             return len(match_descriptors(indices[pair[0]], indices[pair[1]]))
@@ -223,22 +254,24 @@ def two_view_geometry(
     first: tuple[pycolmap.Camera, NDArray[np.float64]],
     second: tuple[pycolmap.Camera, NDArray[np.float64]],
     matches: NDArray[np.uint32],
-    job: Job,
+    seed: int,
+    drop_stationary: bool = False,
 ) -> pycolmap.TwoViewGeometry:
     """The two-view geometry of two photographs; without inliers if it has too few.
 
     Args:
         first, second: the camera of a photograph and its keypoints [N, 2].
         matches: [M, 2] indices of keypoints.
-        job: its seed, and whether stationary matches are dropped.
+        seed: of RANSAC.
+        drop_stationary: as in `job.Matching`.
     """
     nothing = pycolmap.TwoViewGeometry()
     if len(matches) < FEWEST_INLIERS:
         return nothing
     options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.random_seed = job.seed
+    options.ransac.random_seed = seed
     options.ransac.max_num_trials = MOST_TRIALS
     options.compute_relative_pose = True  # also tells a pure rotation from a planar scene
-    options.filter_stationary_matches = job.drop_stationary
+    options.filter_stationary_matches = drop_stationary
     found = pycolmap.estimate_two_view_geometry(*first, *second, matches, options)
     return found if len(found.inlier_matches) >= FEWEST_INLIERS else nothing

@@ -11,12 +11,12 @@ import pycolmap
 
 from stages.scene.rotations import matrices_of
 from stages.sfm.worker import database as sqlite
-from stages.sfm.worker.job import CameraGuess, Job
+from stages.sfm.worker.job import CameraGuess, Photographs
 
 FOCAL_WITHOUT_PRIOR = 1.2  # x the longer side: COLMAP's guess without EXIF
 
 
-def create(path: Path, job: Job, only: Collection[int] | None = None) -> None:
+def create(path: Path, photographs: Photographs, only: Collection[int] | None = None) -> None:
     """Write a database with cameras and photographs, ids = position + 1; it appears at `path` when
     it is complete. only: positions of the photographs to write, by default all.
 
@@ -25,9 +25,10 @@ def create(path: Path, job: Job, only: Collection[int] | None = None) -> None:
     partial = path.with_name(path.name + ".partial")
     sqlite.delete(partial)
     database = pycolmap.Database.open(partial)
-    rig_of = _write_rigs(database, job.cameras)
+    rig_of = _write_rigs(database, photographs.cameras)
     frames: dict[int, pycolmap.Frame] = {}
-    for image_id, (name, position) in enumerate(zip(job.names, job.camera_of, strict=True), 1):
+    columns = photographs.names, photographs.camera_of, photographs.frame_of
+    for image_id, (name, position, number) in enumerate(zip(*columns, strict=True), 1):
         if only is not None and image_id - 1 not in only:
             continue
         image = pycolmap.Image()
@@ -35,9 +36,8 @@ def create(path: Path, job: Job, only: Collection[int] | None = None) -> None:
         image.name = name
         image.camera_id = position + 1
         database.write_image(image, use_image_id=True)
-        frame_id = int(job.frames[image_id - 1]) + 1
-        frame = frames.setdefault(frame_id, pycolmap.Frame())
-        frame.frame_id = frame_id
+        frame = frames.setdefault(number, pycolmap.Frame())
+        frame.frame_id = number + 1
         frame.rig_id = rig_of[position]
         frame.add_data_id(image.data_id)
     for frame in frames.values():

@@ -13,7 +13,8 @@ from stages.base.disk import disk_full
 from stages.base.errors import Interrupted, ReconstructionError
 from stages.base.parent import end_child, how_it_ended, python_module, start_child
 from stages.base.stage import Report
-from stages.sfm.worker.job import Job, progress_path, read_progress
+from stages.sfm.worker.job import Job
+from stages.sfm.worker.progress import progress_path, read_progress
 
 _POLL_SECONDS = 0.1
 _TICK_SECONDS = 0.5
@@ -93,10 +94,10 @@ def run_worker(
 def run_step(job: Job, folder: Path, report: Report, max_seconds: float, suffix: str = "") -> None:
     """`run_worker`, with the worker's progress passed to `report`. suffix: added to its phases."""
     unit = "pairs" if job.step in ("matching", "neighbours", "learned") else "photographs"
-    progress_path(job).unlink(missing_ok=True)
+    progress_path(job.project.database).unlink(missing_ok=True)
 
     def tick() -> None:
-        progress = read_progress(job)
+        progress = read_progress(job.project.database)
         if progress is not None:
             phase, done, total = progress
             report.progress(done, total, phase + suffix, **{unit: done})
@@ -121,7 +122,7 @@ def _watch(
             raise Interrupted
         now = time.monotonic()
         if now > deadline:
-            raise WorkerTimedOut(len(job.names))
+            raise WorkerTimedOut(len(job.project.photographs))
         if now >= next_tick:
             tick()
             next_tick = now + _TICK_SECONDS

@@ -4,18 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from stages.sfm.worker.job import CameraGuess, Job
+from stages.sfm.worker.job import CameraGuess, Features, Photographs, Project, Sift
 
 
-def job(folder: Path) -> Job:
-    return Job(
-        step="features",
-        images_root=str(folder),
-        database=str(folder / "a.db"),
-        out="",
-        names=("é 1.jpg",),
-        camera_of=(0,),
-        frame_of=(0,),
-        cameras=(CameraGuess(640, 480, None),),
-        masks=("",),
-    )
+def job(folder: Path) -> Features:
+    cameras = (CameraGuess(640, 480, None),)
+    photographs = Photographs(folder, ("é 1.jpg",), ("",), (0,), (0,), cameras)
+    return Features(Project(folder / "a.db", photographs), Sift())

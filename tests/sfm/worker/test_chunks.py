@@ -13,7 +13,14 @@ import pytest
 from stages.sfm.worker import chunks
 from stages.sfm.worker import database as sqlite
 from stages.sfm.worker.chunks import Chunk
-from stages.sfm.worker.job import Job, chunks_path, selected_pairs_path
+from stages.sfm.worker.job import (
+    Features,
+    Matching,
+    PairSelection,
+    Project,
+    chunks_path,
+    selected_pairs_path,
+)
 from tests.sfm.worker import sample_jobs as jobs
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]  # a process for each chunk
@@ -27,17 +34,17 @@ def rows(database: Path, table: str) -> list[tuple[object, ...]]:
         return connection.execute(f"SELECT * FROM {table} ORDER BY 1").fetchall()
 
 
-def found(job: Job) -> dict[str, list[tuple[object, ...]]]:
-    return {table: rows(Path(job.database), table) for table in TABLES}
+def found(project: Project) -> dict[str, list[tuple[object, ...]]]:
+    return {table: rows(project.database, table) for table in TABLES}
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Job:
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Project:
     """Features and matches found by one process."""
-    job = jobs.sample_job(tmp_path_factory.mktemp("whole"), PHOTOGRAPHS)
-    jobs.work(job)
-    jobs.work(replace(job, step="matching"))
-    return job
+    project = jobs.sample_project(tmp_path_factory.mktemp("whole"), PHOTOGRAPHS)
+    jobs.work(Features(project, jobs.SIFT))
+    jobs.work(Matching(project, "auto"))
+    return project
 
 
 class SerialExecutor:
@@ -56,14 +63,15 @@ class SerialExecutor:
                 raise KeyboardInterrupt
 
 
-def run_in_chunks(job: Job, executor: SerialExecutor) -> None:
-    chunks.extract_features_in_chunks(job, executor, lambda: None)
-    jobs.work(job)
+def run_in_chunks(project: Project, executor: SerialExecutor) -> None:
+    features, matching = Features(project, jobs.SIFT), Matching(project, "auto")
+    chunks.extract_features_in_chunks(features, executor, lambda: None)
+    jobs.work(features)
     left = 1
     while left:
-        jobs.work(replace(job, step="pair selection"))
-        left = chunks.match_pairs_in_chunks(job, executor, lambda: None)
-    jobs.work(replace(job, step="matching"))
+        jobs.work(PairSelection(project, "auto"))
+        left = chunks.match_pairs_in_chunks(matching, executor, lambda: None)
+    jobs.work(matching)
 
 
 @pytest.fixture(autouse=True)
@@ -72,41 +80,41 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(chunks, "PAIRS_PER_CHUNK", 20)
 
 
-def test_chunks_find_what_one_process_finds(whole: Job, tmp_path: Path) -> None:
-    job, executor = jobs.sample_job(tmp_path, PHOTOGRAPHS), SerialExecutor()
-    run_in_chunks(job, executor)
-    assert found(job) == found(whole)
+def test_chunks_find_what_one_process_finds(whole: Project, tmp_path: Path) -> None:
+    project, executor = jobs.sample_project(tmp_path, PHOTOGRAPHS), SerialExecutor()
+    run_in_chunks(project, executor)
+    assert found(project) == found(whole)
     assert len(executor.names) == len(set(executor.names)) > 3
-    assert not list(chunks_path(job).glob("*.db"))
+    assert not list(chunks_path(project.database).glob("*.db"))
 
 
-def test_finished_chunks_are_kept_when_the_executor_fails(whole: Job, tmp_path: Path) -> None:
-    job, executor = jobs.sample_job(tmp_path, PHOTOGRAPHS), SerialExecutor(fail_after=1)
+def test_finished_chunks_are_kept_when_the_executor_fails(whole: Project, tmp_path: Path) -> None:
+    project, executor = jobs.sample_project(tmp_path, PHOTOGRAPHS), SerialExecutor(fail_after=1)
     for _ in range(2):  # among features, and among matches
         with pytest.raises(KeyboardInterrupt):
-            run_in_chunks(job, executor)
+            run_in_chunks(project, executor)
         executor.fail_after = 2
-    run_in_chunks(job, executor)
-    assert found(job) == found(whole)
+    run_in_chunks(project, executor)
+    assert found(project) == found(whole)
     assert len(executor.names) == len(set(executor.names))
 
 
-def test_exhaustive_pairs_and_known_matches_work_in_chunks(whole: Job, tmp_path: Path) -> None:
-    plain, shared = tmp_path / "plain.db", tmp_path / "shared.db"
-    for path in (plain, shared):
-        sqlite.copy(Path(whole.database), path)
-        sqlite.delete_geometries(path)
-    wanted = replace(whole, step="matching", matching="exhaustive", drop_stationary=True)
-    jobs.work(replace(wanted, database=str(plain)))
-    job = replace(wanted, database=str(shared), step="pair selection")
-    jobs.work(job)
+def test_exhaustive_pairs_and_known_matches_work_in_chunks(whole: Project, tmp_path: Path) -> None:
+    alone = replace(whole, database=tmp_path / "alone.db")
+    shared = replace(whole, database=tmp_path / "shared.db")
+    for project in (alone, shared):
+        sqlite.copy(whole.database, project.database)
+        sqlite.delete_geometries(project.database)
+    jobs.work(Matching(alone, "exhaustive", drop_stationary=True))
+    jobs.work(PairSelection(shared, "exhaustive"))
+    job = Matching(shared, "exhaustive", drop_stationary=True)
     assert chunks.match_pairs_in_chunks(job, SerialExecutor(), lambda: None) == 36
-    jobs.work(job)
-    assert selected_pairs_path(job).read_text() == "[]"
-    assert found(job) == found(replace(job, database=str(plain)))
+    jobs.work(PairSelection(shared, "exhaustive"))
+    assert selected_pairs_path(shared.database).read_text() == "[]"
+    assert found(shared) == found(alone)
 
 
-def test_a_finished_chunk_is_not_run_again(whole: Job, tmp_path: Path) -> None:
+def test_a_finished_chunk_is_not_run_again(whole: Project, tmp_path: Path) -> None:
     out = tmp_path / "pair-0-1.db"
     out.write_bytes(b"done")
     chunks.run_chunk(Chunk(tmp_path / "no job", out, pairs=((0, 1),)))

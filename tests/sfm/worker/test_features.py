@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from stages.sfm.worker import features
+from stages.sfm.worker.job import Features
 from tests.sfm.worker import sample_jobs as jobs
 
 
@@ -74,7 +75,7 @@ def test_a_blank_picture_has_no_features(tmp_path: Path) -> None:
     assert (keypoints.shape, descriptors.shape) == ((0, 4), (0, 128))
 
 
-def rows(database: str) -> list[tuple[object, ...]]:
+def rows(database: Path) -> list[tuple[object, ...]]:
     with closing(sqlite3.connect(database)) as connection:
         return [
             row
@@ -84,19 +85,19 @@ def rows(database: str) -> list[tuple[object, ...]]:
 
 
 def test_any_number_of_threads_and_a_new_start_give_the_same(tmp_path: Path) -> None:
-    job = jobs.sample_job(tmp_path, photographs=5)
-    jobs.work(job)
-    wanted = rows(job.database)
+    project = jobs.sample_project(tmp_path, photographs=5)
+    jobs.work(Features(project, jobs.SIFT))
+    wanted = rows(project.database)
     (tmp_path / "other").mkdir()
-    other = replace(job, database=str(tmp_path / "other" / "base.db"), threads=3)
-    jobs.work(other)
+    other = replace(project, database=tmp_path / "other" / "base.db", threads=3)
+    jobs.work(Features(other, jobs.SIFT))
     assert rows(other.database) == wanted
     with closing(sqlite3.connect(other.database)) as connection:
         for table in ("keypoints", "descriptors"):
             connection.execute(f"DELETE FROM {table} WHERE image_id IN (2, 5)")
         connection.execute("UPDATE keypoints SET rows = 7 WHERE image_id = 1")
         connection.commit()
-    jobs.work(other)
+    jobs.work(Features(other, jobs.SIFT))
     again = rows(other.database)
     assert again[0][1] == 7, "what is there is kept"
     assert again[1:] == wanted[1:]

@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 
 from stages.sfm.worker import database as sqlite
-from stages.sfm.worker.job import Job, read_progress
+from stages.sfm.worker.job import Features, Matching, Project
 from stages.sfm.worker.pairs import exhaustive_pairs
+from stages.sfm.worker.progress import read_progress
 from tests.sfm.worker import sample_jobs as jobs
 
 PHOTOGRAPHS = 9
@@ -20,31 +21,25 @@ Rows = list[tuple[object, ...]]
 
 
 @pytest.fixture(scope="module")
-def features(tmp_path_factory: pytest.TempPathFactory) -> Job:
-    job = jobs.sample_job(tmp_path_factory.mktemp("features"), PHOTOGRAPHS)
-    jobs.work(job)
-    return job
+def features(tmp_path_factory: pytest.TempPathFactory) -> Project:
+    project = jobs.sample_project(tmp_path_factory.mktemp("features"), PHOTOGRAPHS)
+    jobs.work(Features(project, jobs.SIFT))
+    return project
 
 
-def matching(features: Job, folder: Path, how: str, threads: int = 2) -> Job:
+def matching(features: Project, folder: Path, how: str, threads: int = 2) -> Matching:
     database = folder / "base.db"
-    sqlite.copy(Path(features.database), database)
-    return replace(
-        features,
-        step="matching",
-        database=str(database),
-        matching=how,
-        threads=threads,
-    )
+    sqlite.copy(features.database, database)
+    return Matching(replace(features, database=database, threads=threads), how)
 
 
-def found(job: Job, table: str) -> Rows:
-    with closing(sqlite3.connect(job.database)) as connection:
+def found(job: Matching, table: str) -> Rows:
+    with closing(sqlite3.connect(job.project.database)) as connection:
         return connection.execute(f"SELECT * FROM {table} ORDER BY pair_id").fetchall()
 
 
 @pytest.fixture(scope="module")
-def whole(features: Job, tmp_path_factory: pytest.TempPathFactory) -> tuple[Rows, Rows]:
+def whole(features: Project, tmp_path_factory: pytest.TempPathFactory) -> tuple[Rows, Rows]:
     """What one thread finds."""
     job = matching(features, tmp_path_factory.mktemp("whole"), "exhaustive", 1)
     jobs.work(job)
@@ -53,31 +48,31 @@ def whole(features: Job, tmp_path_factory: pytest.TempPathFactory) -> tuple[Rows
 
 @pytest.mark.slow
 def test_three_threads_find_what_one_finds(
-    features: Job, whole: tuple[Rows, Rows], tmp_path: Path
+    features: Project, whole: tuple[Rows, Rows], tmp_path: Path
 ) -> None:
     job = matching(features, tmp_path, "exhaustive", 3)
     jobs.work(job)
     assert (found(job, "matches"), found(job, "two_view_geometries")) == whole
     assert len(whole[0]) == len(exhaustive_pairs(PHOTOGRAPHS))
-    assert read_progress(job) == ("matching", 36, 36)
+    assert read_progress(job.project.database) == ("matching", 36, 36)
 
 
 @pytest.mark.slow
 def test_what_was_found_before_is_kept_and_the_missing_added(
-    features: Job, whole: tuple[Rows, Rows], tmp_path: Path
+    features: Project, whole: tuple[Rows, Rows], tmp_path: Path
 ) -> None:
-    job = matching(features, tmp_path, "selected")
+    job = matching(features, tmp_path, "auto")
     jobs.work(job)
     chosen = found(job, "two_view_geometries")
     assert len(chosen) >= PHOTOGRAPHS - 1
     assert set(chosen) <= set(whole[1])
-    with closing(sqlite3.connect(job.database)) as connection:  # marked, to know them again
+    with closing(sqlite3.connect(job.project.database)) as connection:  # marked, to know them again
         connection.execute("UPDATE two_view_geometries SET config = 7")
         connection.execute("DELETE FROM matches WHERE pair_id % 3 = 0")
         connection.execute("DELETE FROM two_view_geometries WHERE pair_id % 3 = 0")
         connection.commit()
         kept = connection.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone()[0]
-    jobs.work(replace(job, matching="exhaustive"))
+    jobs.work(replace(job, how="exhaustive"))
     now = found(job, "two_view_geometries")
     assert len(now) == len(whole[1])
     assert sum(row[4] == 7 for row in now) == kept
@@ -86,11 +81,11 @@ def test_what_was_found_before_is_kept_and_the_missing_added(
 
 
 def test_matches_without_a_geometry_are_verified_and_not_matched_again(
-    features: Job, whole: tuple[Rows, Rows], tmp_path: Path
+    features: Project, whole: tuple[Rows, Rows], tmp_path: Path
 ) -> None:
     job = matching(features, tmp_path, "exhaustive")
     jobs.work(job)
-    with closing(sqlite3.connect(job.database)) as connection:
+    with closing(sqlite3.connect(job.project.database)) as connection:
         connection.execute("DELETE FROM two_view_geometries")
         connection.execute("UPDATE matches SET rows = 0, data = '' WHERE pair_id % 2 = 0")
         connection.commit()
@@ -99,14 +94,14 @@ def test_matches_without_a_geometry_are_verified_and_not_matched_again(
         assert row[1] == (0 if int(str(row[0])) % 2 == 0 else before[1])
 
 
-def test_photographs_without_features_match_nothing(features: Job, tmp_path: Path) -> None:
-    job = matching(features, tmp_path, "selected")
-    with closing(sqlite3.connect(job.database)) as connection:
+def test_photographs_without_features_match_nothing(features: Project, tmp_path: Path) -> None:
+    job = matching(features, tmp_path, "auto")
+    with closing(sqlite3.connect(job.project.database)) as connection:
         for table in ("keypoints", "descriptors"):
             connection.execute(f"UPDATE {table} SET rows = 0, data = '' WHERE image_id = 4")
         connection.commit()
     jobs.work(job)
-    inliers = sqlite.inliers_of_pairs(Path(job.database))
+    inliers = sqlite.inliers_of_pairs(job.project.database)
     assert {pair for pair in inliers if 3 in pair} == {
         p for p in exhaustive_pairs(PHOTOGRAPHS) if 3 in p
     }

@@ -7,17 +7,25 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
 from threading import Event, Timer
 
+import numpy as np
 import pytest
 
 from stages.base.errors import Interrupted, SplatError
 from stages.sfm.worker import process
-from stages.sfm.worker.job import Job
+from stages.sfm.worker.job import Job, KnownCameras, MatchingChunk, Neighbours, Triangulation
 from tests import processes
 from tests.sfm.worker.jobs import job
+
+
+@dataclass(frozen=True)
+class Nonsense(Job):
+    """A step that the worker does not know."""
+
+    step = "nonsense"
 
 
 def pretend(monkeypatch: pytest.MonkeyPatch, code: str) -> None:
@@ -34,7 +42,24 @@ def run(tmp_path: Path, stop: Event | None = None, max_seconds: float = 30.0) ->
 
 
 def test_a_job_survives_being_written(tmp_path: Path) -> None:
-    assert Job.read(job(tmp_path).write(tmp_path / "job.json")) == job(tmp_path)
+    project, file = job(tmp_path).project, tmp_path / "job.json"
+    assert Job.read(job(tmp_path).write(file)) == job(tmp_path)
+    chunk = MatchingChunk(project, tmp_path / "b.db", ((0, 1), (0, 2)), drop_stationary=True)
+    assert Job.read(chunk.write(file)) == chunk
+
+
+def test_known_cameras_survive_being_written_exactly(tmp_path: Path) -> None:
+    project, file = job(tmp_path).project, tmp_path / "job.json"
+    random = np.random.default_rng(0)
+    cameras = KnownCameras(random.random((1, 4)), random.random((1, 4, 4)), np.eye(3)[None])
+    triangulation = Triangulation(project, tmp_path / "out", cameras, refine=True)
+    read = Job.read(triangulation.write(file))
+    assert isinstance(read, Triangulation)
+    assert (read.project, read.out, read.refine) == (project, tmp_path / "out", True)
+    for name, values in vars(cameras).items():
+        np.testing.assert_array_equal(getattr(read.cameras, name), values)
+    neighbours = Job.read(Neighbours(project, cameras.intrinsics, ((0, 1),)).write(file))
+    np.testing.assert_array_equal(neighbours.intrinsics, cameras.intrinsics)
 
 
 def test_success_ticks_at_least_at_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -95,7 +120,7 @@ def test_photographs_beside_a_module_of_the_same_name_do_no_harm(
     for name in ("numpy.py", "stages.py", "json.py"):
         (tmp_path / name).write_text("raise SystemExit('shadowed')")
     monkeypatch.chdir(tmp_path)
-    unknown = replace(job(tmp_path), step="nonsense")
+    unknown = Nonsense(job(tmp_path).project)
     with pytest.raises(process.WorkerCrashed) as crash:
         process.run_worker(unknown, tmp_path, Event(), 30.0, lambda: None)
     log = (tmp_path / "log.txt").read_text()

@@ -20,7 +20,7 @@ from stages.sfm import stage as sfm
 from stages.sfm.checks.statistics import model_statistics
 from stages.sfm.settings import SfmSettings
 from stages.sfm.worker import pairs
-from stages.sfm.worker.job import job_of
+from stages.sfm.worker.job import Mapping, project_of
 from stages.sfm.worker.sparse_model import MappingResult, without_implausible_views
 from tests.benchmarks import panoramas
 from tests.sfm.synthetic import orbit_model
@@ -47,9 +47,9 @@ def test_the_database_has_the_rig_with_the_turns_that_faces_were_cut_at(tmp_path
     pycolmap = pytest.importorskip("pycolmap")
     from stages.sfm.worker import new_database
 
-    job = job_of(capture(tmp_path, 2), tmp_path, 0, 1000, "auto")
+    project = project_of(capture(tmp_path, 2), tmp_path, 0)
     path = tmp_path / "rig.db"
-    new_database.create(path, job)
+    new_database.create(path, project.photographs)
     with pycolmap.Database.open(path) as database:
         rig, plain = sorted(database.read_all_rigs(), key=lambda rig: -rig.num_sensors())
         frames = database.read_all_frames()
@@ -72,7 +72,7 @@ def test_limits_of_the_mapper_count_panoramas(
     from stages.sfm.worker import mapping
 
     taken = capture(tmp_path, 4)
-    job = job_of(replace(taken, photos=taken.photos[: 4 * FACES + single]), tmp_path, 0, 9, "auto")
+    taken = replace(taken, photos=taken.photos[: 4 * FACES + single])
     found = []
 
     def mapped(*arguments: Any, **_: Any) -> dict[int, Any]:
@@ -80,7 +80,7 @@ def test_limits_of_the_mapper_count_panoramas(
         return {}
 
     monkeypatch.setattr(pycolmap, "incremental_mapping", mapped)
-    mapping.map_photographs(replace(job, out=str(tmp_path / "model")))
+    mapping.map_photographs(Mapping(project_of(taken, tmp_path, 0), tmp_path / "model", 60))
     (options,) = found
     assert (
         options.max_model_overlap == FACES * pycolmap.IncrementalPipelineOptions().max_model_overlap
@@ -89,7 +89,7 @@ def test_limits_of_the_mapper_count_panoramas(
 
 
 def test_no_two_faces_of_one_panorama_are_matched(tmp_path: Path) -> None:
-    frames = job_of(capture(tmp_path, 2), tmp_path, 0, 1000, "auto").frames
+    frames = project_of(capture(tmp_path, 2), tmp_path, 0).photographs.frames
     assert frames.tolist() == [0] * FACES + [1] * FACES + [2]
     found = pairs.pairs_of_faces(pairs.exhaustive_pairs(3), frames)
     assert len(found) == len(set(found)) == FACES * FACES + 2 * FACES

@@ -10,7 +10,7 @@ pytest.importorskip("pycolmap")
 
 
 def test_pairs_that_agree_on_one_turn_or_its_inverse_are_found_among_others() -> None:
-    from stages.sfm.worker.mapping import FEWEST_TURNED, _turned_pairs
+    from stages.sfm.worker.pair_checks import FEWEST_TURNED, _turned_pairs
 
     turn = random_rotation(1)
     turns = [turn, None, turn.T, random_rotation(2), turn, random_rotation(3), turn.T, turn]
