@@ -36,7 +36,7 @@ _PIXELS_AT_ONCE = 250_000_000  # over all threads; about 4 bytes each while they
 
 @dataclass(frozen=True)
 class _Ingested:
-    """A photograph that was read and written, or why it cannot be used.
+    """A file or a frame: the photographs made of it, or why it cannot be used.
 
     Args:
         name: of the file, or of the frame.
@@ -55,6 +55,27 @@ class _Ingested:
     inside: float = 1.0
     remarks: tuple[str, ...] = ()
     bad_depth: Unusable | None = None
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """A picture to write.
+
+    Args:
+        name: of the file, or of the frame.
+        image: as in `Photo`.
+        decoded: its pixels.
+        mask: file of its mask.
+        video: that it is a frame of; "" for a photograph.
+        sphere: whether it shows the whole sphere.
+    """
+
+    name: str
+    image: str
+    decoded: Decoded
+    mask: Path | None = None
+    video: str = ""
+    sphere: bool = False
 
 
 def run(
@@ -90,26 +111,18 @@ def run(
     if len(usable) < FEWEST_PHOTOGRAPHS:
         raise advice.too_few(root, len(usable), FEWEST_PHOTOGRAPHS, unusable)
     pictures = tuple(replace(one.photos[0], name=one.name) for one in usable)
-    photos = tuple(photo for one in usable for photo in one.photos)
     files = bool(found.masks or settings.rig_mask)
     masking.check_shares(pictures, [one.inside for one in usable], files)
-    bare = [picture.name for picture in pictures if not picture.mask]
-    remarks: dict[str, Sequence[str]] = {
-        code: [o.name for o in ingested if code in o.remarks] for code in advice.TEXTS
-    }
-    remarks |= {
-        "ingest-masks-cut-out": [picture.name for picture in pictures] if cut_out else (),
-        "ingest-mask-missing": bare if len(bare) < len(pictures) else (),
-        "ingest-rig-mask-unused": _rig_mask_unused(photos, settings),
-    }
-    advice.about_names(remarks | advice.unused_files(found), report.warn)
+    remarks = _remarks(usable, pictures, settings, cut_out) | advice.unused_files(found)
+    advice.about_names(remarks, report.warn)
     duplicates = near_duplicates([one.measures.thumbnail for one in usable if one.measures])
     first = {usable[i].name: usable[group[0]].name for group in duplicates for i in group}
-    photos = tuple(replace(photo, duplicate_of=first.get(photo.source, "")) for photo in photos)
+    photos = (photo for one in usable for photo in one.photos)
+    photos = (replace(photo, duplicate_of=first.get(photo.source, "")) for photo in photos)
     _report_capture(pictures, duplicates, report)
     report.metric("left_out", len(unusable))
     report.metric("files_ignored", found.others)
-    capture = Capture(folder, photos)
+    capture = Capture(folder, tuple(photos))
     capture_file.save_capture(capture)
     return capture
 
@@ -119,10 +132,27 @@ def load(folder: Path) -> Capture:
     return load_capture(folder)
 
 
+def _remarks(
+    usable: Sequence[_Ingested],
+    pictures: Sequence[Photo],
+    settings: IngestSettings,
+    cut_out: bool,
+) -> dict[str, Sequence[str]]:
+    """Names of the pictures that each warning is about. cut_out: whether mask files do that."""
+    names = [picture.name for picture in pictures]
+    bare = [picture.name for picture in pictures if not picture.mask]
+    unused = settings.rig_mask is not None and not any(picture.face for picture in pictures)
+    return {code: [one.name for one in usable if code in one.remarks] for code in advice.TEXTS} | {
+        "ingest-masks-cut-out": names if cut_out else (),
+        "ingest-mask-missing": bare if len(bare) < len(names) else (),
+        "ingest-rig-mask-unused": [str(settings.rig_mask)] if unused else (),
+    }
+
+
 def _masks_cut_out(found: Findings, settings: IngestSettings) -> bool:
     """Whether mask files cut out an object, and --mask-means does not say otherwise.
 
-    All photographs must have masks: of the others everything would be seen.
+    All photographs must have masks; one without a mask would show everything around the object.
     """
     masks = [found.masks[one.name] for one in found.sources if one.name in found.masks]
     decided = settings.mask_means != AUTO or bool(found.videos)
@@ -168,7 +198,8 @@ def _ingest_photograph(
         elif kind:
             raise Unusable(f"it is {kind}", hint_for(kind))
         mask = found.masks.get(source.name)
-        done = _write(source.name, source.image, decoded, settings, folder, mask, kind=kind)
+        picture = _Picture(source.name, source.image, decoded, mask, sphere=kind == SPHERE)
+        done = _write(picture, settings, folder)
     except Unusable as error:
         return _Ingested(source.name, error=error)
     depth = found.depths.get(source.name)
@@ -194,53 +225,30 @@ def _ingest_video(
     """The chosen frames of a video, as photographs of one camera."""
     try:
         kind, chosen = video_frames.photographs(source, settings.frames, settings.max_side, report)
-        return [
-            _write(
-                f"{source.name}/{number}",
-                f"{source.image}/{number}",
-                decoded,
-                settings,
-                folder,
-                video=source.name,
-                kind=kind,
-            )
+        name, image, sphere = source.name, source.image, kind == SPHERE
+        pictures = (
+            _Picture(f"{name}/{number}", f"{image}/{number}", decoded, video=name, sphere=sphere)
             for number, decoded in chosen
-        ]
+        )
+        return [_write(picture, settings, folder) for picture in pictures]
     except Unusable as error:
         return [_Ingested(source.name, error=error)]
 
 
-def _write(
-    name: str,
-    image: str,
-    decoded: Decoded,
-    settings: IngestSettings,
-    folder: Path,
-    mask: Path | None = None,
-    video: str = "",
-    kind: str = "",
-) -> _Ingested:
+def _write(picture: _Picture, settings: IngestSettings, folder: Path) -> _Ingested:
     """Write a normalised picture and its mask, or the faces of a panorama, and measure it. Raises
-    Unusable if a mask leaves no face.
-
-    Args:
-        name: of the file, or of the frame.
-        image: as in `Photo`.
-        decoded: the picture.
-        settings: of the stage.
-        folder: of the stage's output.
-        mask: file of its mask.
-        video: that it is a frame of.
-        kind: `panorama.SPHERE` or "".
-    """
-    masked = MaskedPhoto.of(decoded, name, mask, settings.invert_masks, settings.mask_means)
-    if kind == SPHERE and settings.rig_mask is not None:
+    Unusable if a mask leaves no face. folder: of the stage's output."""
+    name = picture.name
+    masked = MaskedPhoto.of(
+        picture.decoded, name, picture.mask, settings.invert_masks, settings.mask_means
+    )
+    if picture.sphere and settings.rig_mask is not None:
         masked = masked.without(settings.rig_mask, name)
     decoded = masked.decoded
     measures = measure(decoded.pixels, masked.mask)
-    photo = _photo(name, image, masked, measures, video)
-    parts = face_photos(photo, masked) if kind == SPHERE else ((photo, masked),)
-    photos = tuple(write_photo(part, picture, folder) for part, picture in parts)
+    photo = _photo(picture, masked, measures)
+    parts = face_photos(photo, masked) if picture.sphere else ((photo, masked),)
+    photos = tuple(write_photo(part, masked_part, folder) for part, masked_part in parts)
     if not photos:
         raise Unusable("masks leave nothing of it", "Check the masks")
     remarks = {
@@ -254,37 +262,35 @@ def _write(
     return _Ingested(name, photos, measures, inside=masked.share, remarks=codes)
 
 
-def _photo(name: str, image: str, masked: MaskedPhoto, measures: Measures, video: str) -> Photo:
-    """What is known of a picture. Arguments as of `_write`."""
+def _photo(picture: _Picture, masked: MaskedPhoto, measures: Measures) -> Photo:
+    """What is known of a picture."""
     decoded, exif = masked.decoded, masked.decoded.exif
     height, width = decoded.pixels.shape[:2]
     focal = exif.focal_px(decoded.stored, width, height)
     return Photo(
-        name=name,
-        image=image,
+        name=picture.name,
+        image=picture.image,
         width=width,
         height=height,
         focal_px=round(focal, 3) if focal is not None else None,
-        camera=_video_key(video, width, height) if video else exif.camera_key(width, height),
+        camera=_camera_key(picture, masked),
         sharpness=measures.sharpness,
         log2_luminance=measures.log2_luminance,
         exposure_ev=round(exif.exposure_ev, 3) if exif.exposure_ev is not None else None,
         gps=exif.gps.position,
         gps_height=exif.gps.height,
         gps_error_m=exif.gps.error_m,
-        mask=masked.file(image),
+        mask=masked.file(picture.image),
         outside=masked.outside,
     )
 
 
-def _video_key(video: str, width: int, height: int) -> str:
-    """As `Exif.camera_key`: each video has a lens of its own, and no make of camera."""
-    return f"video, {width}x{height} {video.replace(',', ' ')}"
-
-
-def _rig_mask_unused(photos: Sequence[Photo], settings: IngestSettings) -> Sequence[str]:
-    unused = settings.rig_mask is not None and not any(photo.face for photo in photos)
-    return (str(settings.rig_mask),) if unused else ()
+def _camera_key(picture: _Picture, masked: MaskedPhoto) -> str:
+    """`Exif.camera_key`, or one like it for a video: its frames share a lens of their own."""
+    height, width = masked.decoded.pixels.shape[:2]
+    if picture.video:
+        return f"video, {width}x{height} {picture.video.replace(',', ' ')}"
+    return masked.decoded.exif.camera_key(width, height)
 
 
 def _report_capture(

@@ -16,7 +16,15 @@ from numpy.typing import NDArray
 
 from stages.base.errors import ReconstructionError, SplatError
 from stages.base.stage import Report
-from stages.scene import Reconstruction, Splats, draw_settings_of, logit, rgb_to_dc, split_held_out
+from stages.scene import (
+    Reconstruction,
+    Splats,
+    View,
+    draw_settings_of,
+    logit,
+    rgb_to_dc,
+    split_held_out,
+)
 from stages.scene.storage import load_splats, save_splats
 from stages.seed.empty_cells import fill_cells
 from stages.seed.measured_depth import measured_points
@@ -42,27 +50,15 @@ def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report:
     Raises SplatError "seed-too-few-points" if fewer than 50 points are usable.
     """
     reconstruction: Reconstruction = inputs["sfm"]
-    finite: NDArray[np.bool_] = np.all(np.isfinite(reconstruction.points), axis=1)
-    reasons: dict[str, NDArray[np.bool_]] = {"not_finite": ~finite}
-    if not settings.keep_outliers and finite.any():
-        reasons |= _outliers(reconstruction, finite)
-    keep = ~np.logical_or.reduce(list(reasons.values()))
-    _report_outliers(reasons, keep, report)
+    keep = _usable(reconstruction, settings.keep_outliers, report)
     points = reconstruction.points[keep]
     if len(points) < _FEWEST_SPLATS:
         raise _too_few(len(points), len(reconstruction.points))
     colours = reconstruction.colours[keep].astype(np.float64) / 255.0
     training, _ = split_held_out(reconstruction.views)  # held-out views give no points or colours
+    chosen = selected_views(training, points) if settings.fill else ()
     if settings.fill:
-        chosen = selected_views(training, points)
-        more, more_colours = plane_sweep_points(reconstruction.folder, chosen, points)
-        report.metric("plane_sweep_points", len(more))
-        points, colours = np.concatenate([points, more]), np.concatenate([colours, more_colours])
-        if any(view.depth for view in chosen):
-            more, more_colours = measured_points(reconstruction.folder, chosen, points, report)
-            report.metric("measured_points", len(more))
-            points = np.concatenate([points, more])
-            colours = np.concatenate([colours, more_colours])
+        points, colours = _with_depth_maps(reconstruction.folder, chosen, points, colours, report)
     scales, clamped = _scales(points, reconstruction)
     report.metric("median_scale", float(np.median(scales)))
     report.metric("scales_clamped", clamped)
@@ -93,6 +89,37 @@ def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report:
 def load(folder: Path) -> Splats:
     """The splats of a finished folder."""
     return load_splats(folder)
+
+
+def _usable(
+    reconstruction: Reconstruction, keep_outliers: bool, report: Report
+) -> NDArray[np.bool_]:
+    """[P] the points to start from: finite, and no outliers unless these are kept."""
+    finite: NDArray[np.bool_] = np.all(np.isfinite(reconstruction.points), axis=1)
+    reasons: dict[str, NDArray[np.bool_]] = {"not_finite": ~finite}
+    if not keep_outliers and finite.any():
+        reasons |= _outliers(reconstruction, finite)
+    keep = ~np.logical_or.reduce(list(reasons.values()))
+    _report_outliers(reasons, keep, report)
+    return np.asarray(keep)
+
+
+def _with_depth_maps(
+    folder: Path,
+    views: tuple[View, ...],
+    points: NDArray[np.float64],
+    colours: NDArray[np.float64],
+    report: Report,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Points [P, 3] and colours [P, 3] with those of a plane sweep and of measured depth."""
+    more, more_colours = plane_sweep_points(folder, views, points)
+    report.metric("plane_sweep_points", len(more))
+    points, colours = np.concatenate([points, more]), np.concatenate([colours, more_colours])
+    if any(view.depth for view in views):
+        more, more_colours = measured_points(folder, views, points, report)
+        report.metric("measured_points", len(more))
+        points, colours = np.concatenate([points, more]), np.concatenate([colours, more_colours])
+    return points, colours
 
 
 def _outliers(

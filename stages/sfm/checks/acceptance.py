@@ -15,10 +15,6 @@ from stages.sfm.learned.weights import INSTALL, installed
 from stages.sfm.worker.sparse_model import SparseModel
 
 _FEWEST_PARTIAL_POINTS = 50
-_REPORTED = (
-    *("configuration", "keypoints_median", "mean_track_length"),
-    *("median_triangulation_angle_deg", "baseline_over_depth"),
-)
 
 
 def accepted_model(
@@ -119,9 +115,10 @@ def with_hint(found: SplatError, features: str) -> SplatError:
 
 def report_metrics(best: Attempt, model: SparseModel, report: Report) -> None:
     """The metrics of the attempt that is used, and of its `model`."""
-    metrics = attempt_metrics(best)
-    for name in _REPORTED:
-        report.metric(name, metrics[name])
+    report.metric("configuration", best.configuration.name)
+    report.metric("keypoints_median", best.keypoints_median)
+    for name in ("mean_track_length", "median_triangulation_angle_deg", "baseline_over_depth"):
+        report.metric(name, round(getattr(best.statistics, name), 4))
     report.metric("focal_px", [round(float(f), 2) for f in model.camera_params[:, 0]])
     report.metric("distortion", [round(float(k), 5) for k in model.camera_params[:, 3]])
     report.metric("pairs_matched", best.pairs_matched)

@@ -3,9 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class PoseCheck:
+    """Median inlier ratios of given poses (`median_inlier_ratio`); None without pairs to check.
+
+    Args:
+        pairs: how many matched.
+        given: of the poses as they are given.
+        rough: the same at four times the distance.
+        mistakes: by likely mistake, of the poses corrected for it.
+        refined: of refined poses; None as well if they were not refined.
+    """
+
+    pairs: int
+    given: float | None
+    rough: float | None
+    mistakes: dict[str, float | None]
+    refined: float | None = None
+
 
 MatchedPair = tuple[int, int, NDArray[np.float64], NDArray[np.float64]]
 
@@ -20,8 +41,7 @@ def median_inlier_ratio(
     world_to_camera: NDArray[np.float64],
     side: float,
 ) -> float | None:
-    """The median over pairs of `fitting_shares`; None without pairs, and where all are seen from
-    one place."""
+    """The median of `inlier_ratios`; None without pairs, and where no pair has a baseline."""
     ratios = inlier_ratios(pairs, intrinsics, world_to_camera, side)
     ratios = ratios[~np.isnan(ratios)]
     return float(np.median(ratios)) if len(ratios) else None

@@ -25,6 +25,7 @@ from stages.cameras.undistortion import undistorted_camera
 from stages.scene import Camera, Capture, Photo, Reconstruction
 from stages.scene.rotations import quaternions_of
 from stages.sfm.finish import COLMAP, write_reconstruction
+from stages.sfm.known.epipolar import PoseCheck
 from stages.sfm.known.match_cameras import match_cameras
 from stages.sfm.known.pinhole_views import PinholeView, write_pinhole_views
 from stages.sfm.known.points import find_points
@@ -89,7 +90,8 @@ def reconstruct(
     project = _project([views[i] for i in training], folder, work, settings.seed)
     known = _known_cameras([views[i] for i in training])
     out = _match(project, known, settings, work, deadline, report)
-    _check_poses(out, report, settings.allow_partial)
+    check = json.loads((out / "pose_check.json").read_text(encoding="utf-8"))
+    _check_poses(PoseCheck(**check), settings, report)
     if settings.refine_cameras:
         views = _refined(views, out / POINTS, report)
     chosen = [views[i] for i in training]
@@ -240,16 +242,15 @@ def _refined(views: Sequence[PinholeView], path: Path, report: Report) -> list[P
     return [replace(view, camera=camera) for view, camera in zip(views, moved, strict=True)]
 
 
-def _check_poses(out: Path, report: Report, allow_partial: bool) -> None:
+def _check_poses(check: PoseCheck, settings: SfmSettings, report: Report) -> None:
     """Refuse poses that do not fit the matches, and name the likely cause."""
-    found = json.loads((out / "pose_check.json").read_text(encoding="utf-8"))
-    ratio = found["given"]
-    if "refined" in found:
+    ratio = check.given
+    if settings.refine_cameras:
         report.metric("epipolar_inlier_ratio_before", None if ratio is None else round(ratio, 4))
-        ratio = found["refined"]
-    report.metric("matched_pairs", found["pairs"])
+        ratio = check.refined
+    report.metric("matched_pairs", check.pairs)
     report.metric("epipolar_inlier_ratio", None if ratio is None else round(ratio, 4))
-    if ratio is None or found["pairs"] < FEWEST_PAIRS:
+    if ratio is None or check.pairs < FEWEST_PAIRS:
         report.warn(
             "cameras-unchecked",
             "Too few photographs match each other to check the cameras: they are used as they are.",
@@ -257,9 +258,9 @@ def _check_poses(out: Path, report: Report, allow_partial: bool) -> None:
         return
     if ratio >= INLIER_RATIO:
         return
-    mistake, best = max(found["mistakes"].items(), key=lambda other: other[1] or 0.0)
+    mistake, best = max(check.mistakes.items(), key=lambda other: other[1] or 0.0)
     explained = (best or 0.0) >= INLIER_RATIO
-    if not explained and found["rough"] >= ROUGH_INLIER_RATIO:
+    if not explained and (check.rough or 0.0) >= ROUGH_INLIER_RATIO:
         report.warn(
             "cameras-rough",
             f"Only {ratio:.0%} of the matches lie within 4 px of 1600 of where the cameras predict "
@@ -279,7 +280,7 @@ def _check_poses(out: Path, report: Report, allow_partial: bool) -> None:
         hint=f"{likely} --allow-partial goes on all the same; with --cameras '' splat finds "
         "cameras itself.",
     )
-    if not allow_partial:
+    if not settings.allow_partial:
         raise error
     report.warn(error.code, f"Accepted because of --allow-partial: {error.given} {likely}")
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from stages.cameras.camera_file import poses_of
 from stages.scene.rotations import similarity
-from stages.sfm.known.epipolar import likely_mistakes, median_inlier_ratio
+from stages.sfm.known.epipolar import PoseCheck, likely_mistakes, median_inlier_ratio
 from stages.sfm.worker.job import CameraGuess, KnownCameras, Neighbours, Project, Triangulation
 from stages.sfm.worker.mapping import point_arrays
 from stages.sfm.worker.matching import match_pairs
@@ -37,8 +37,8 @@ def match_neighbours(job: Neighbours) -> None:
 def triangulate(job: Triangulation) -> None:
     """Check the poses against the matches, and triangulate points with the poses held fixed.
 
-    Writes to `job.out`: pose_check.json, inlier ratios of the given poses and of corrections of
-    likely mistakes (see `known.epipolar`); points.npz, points, observations and poses.
+    Writes to `job.out`: pose_check.json (`epipolar.PoseCheck`), and points.npz with points,
+    observations and poses.
     """
     lens, poses, out = job.cameras.intrinsics, job.cameras.world_to_camera, job.out
     photographs = job.project.photographs
@@ -47,20 +47,19 @@ def triangulate(job: Triangulation) -> None:
     pairs = _matched_points(job.project.database)
     mistakes = _corrected(poses, job.cameras.rotations, photographs.frames)
     side = float(max(max(camera.width, camera.height) for camera in photographs.cameras))
-    found = {
-        "pairs": len(pairs),
-        "matches": sum(len(pair[2]) for pair in pairs),
-        "given": median_inlier_ratio(pairs, lens, poses, side),
-        "rough": median_inlier_ratio(pairs, lens, poses, 4.0 * side),
-        "mistakes": {
+    check = PoseCheck(
+        pairs=len(pairs),
+        given=median_inlier_ratio(pairs, lens, poses, side),
+        rough=median_inlier_ratio(pairs, lens, poses, 4.0 * side),
+        mistakes={
             name: median_inlier_ratio(pairs, lens, corrected, side)
             for name, corrected in mistakes.items()
         },
-    }
+    )
     if job.refine:
         poses = _refined(job, out / "colmap")
-        found["refined"] = median_inlier_ratio(pairs, lens, poses, side)
-    (out / "pose_check.json").write_text(json.dumps(found), encoding="utf-8")
+        check = replace(check, refined=median_inlier_ratio(pairs, lens, poses, side))
+    (out / "pose_check.json").write_text(json.dumps(vars(check)), encoding="utf-8")
     _save_points(_triangulated(job, poses, out / "colmap"), poses, out / "points.npz")
 
 

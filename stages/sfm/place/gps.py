@@ -96,42 +96,99 @@ def scale_from_gps(
         return None
     around, there, heights_known = _positions([photos[i] for i in rows])
     here = centres[rows]
-    flat_here, flat_there = here[:, 0] + 1j * here[:, 2], there[:, 0] + 1j * there[:, 1]
+    flat_there = there[:, 0] + 1j * there[:, 1]
     spread = float(np.sqrt(np.mean(np.abs(flat_there - flat_there.mean()) ** 2)))
     report.metric("gps_spread_m", round(spread, 3))
-    factor, inliers, residual = 0j, np.zeros(len(rows), np.bool_), math.inf
-    if levelled and len(rows) >= _FEWEST:
-        factor, inliers, residual = fit_similarity_2d(flat_here, flat_there)
-    agreeing = int(inliers.sum())
-    if abs(factor):
-        report.metric("gps_residual_m", round(residual, 3))
-        report.metric("gps_agreeing", agreeing)
-    unused = _why_unused(len(rows), levelled, abs(factor), agreeing, residual, spread)
+    flat = _flat_fit(here, there, levelled)
+    if flat.metres:
+        _report_fit(flat, report)
     errors = [photos[i].gps_error_m for i in rows]
     exact = heights_known & [e is not None and e <= _ACCURATE_M for e in errors]
+    unused = _why_unused(flat, levelled, spread)
     if unused:
-        free = _fit_3d(here[exact], there[exact], None, any_tilt=True)
-        off = math.inf if free is None else _off(here[exact], there[exact], *free)
+        free = _free_fit(here, there, exact)
         few = exact.sum() < _AGREEING_SHARE * len(rows)
-        if free is None or few or off > _WORST_RESIDUAL * spread:
+        if free is None or few or free.residual_m > _WORST_RESIDUAL * spread:
             _report_unused(unused, len(rows), len(pictures), spread, report)
             return None
-        inliers, residual, agreeing = exact, off, int(exact.sum())
-        report.metric("gps_residual_m", round(residual, 3))
-        report.metric("gps_agreeing", agreeing)
-    # (x + iz) e^(i angle) rotates x towards z; `about_vertical` rotates the other way.
-    metres, turn = float(abs(factor)), about_vertical(-float(np.angle(factor)))
-    exact &= inliers
-    accurate = int(exact.sum()) >= _FEWEST
-    chosen = exact if accurate else inliers & heights_known
-    level = None if accurate else metres * turn
-    by_all = free if unused else _fit_3d(here[chosen], there[chosen], level)
-    if by_all is not None:
-        metres, turn = by_all
-        report.metric("gps_in_three_dimensions", int(chosen.sum()))
-    scale = MetricScale(metres, f"GPS of {agreeing} photographs, {residual:.2g} m off", turn)
-    place = _place(around, scale.points(here), there, inliers, heights_known)
+        fit = free
+        _report_fit(fit, report)
+    else:
+        fit = _tilted(flat, here, there, heights_known, exact)
+    if fit.spatial:
+        report.metric("gps_in_three_dimensions", fit.spatial)
+    source = f"GPS of {fit.agreeing} photographs, {fit.residual_m:.2g} m off"
+    scale = MetricScale(fit.metres, source, fit.turn)
+    place = _place(around, scale.points(here), there, fit.inliers, heights_known)
     return replace(scale, place=place)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A similarity from the old world to the new one, by GPS positions.
+
+    Args:
+        metres: per unit of the old world; 0: there is none.
+        turn: [3, 3] from the old to the new world.
+        inliers: [N] positions that agree with the cameras.
+        residual_m: RMS distance of these from the cameras.
+        spatial: how many positions were fitted in three dimensions; 0: in the plane only.
+    """
+
+    metres: float
+    turn: NDArray[np.float64]
+    inliers: NDArray[np.bool_]
+    residual_m: float
+    spatial: int = 0
+
+    @property
+    def agreeing(self) -> int:
+        return int(self.inliers.sum())
+
+
+def _flat_fit(here: NDArray[np.float64], there: NDArray[np.float64], levelled: bool) -> _Fit:
+    """By horizontal positions. here, there [N, 3]: in the old world; metres east, north and up."""
+    factor, inliers, residual = 0j, np.zeros(len(here), np.bool_), math.inf
+    if levelled and len(here) >= _FEWEST:
+        flat_here, flat_there = here[:, 0] + 1j * here[:, 2], there[:, 0] + 1j * there[:, 1]
+        factor, inliers, residual = fit_similarity_2d(flat_here, flat_there)
+    # (x + iz) e^(i angle) rotates x towards z; `about_vertical` rotates the other way.
+    turn = about_vertical(-float(np.angle(factor)))
+    return _Fit(float(abs(factor)), turn, inliers, residual)
+
+
+def _free_fit(
+    here: NDArray[np.float64], there: NDArray[np.float64], exact: NDArray[np.bool_]
+) -> _Fit | None:
+    """By the `exact` [N] positions in three dimensions, whatever the level of the cameras."""
+    found = _fit_3d(here[exact], there[exact], None, any_tilt=True)
+    if found is None:
+        return None
+    return _Fit(*found, exact, _off(here[exact], there[exact], *found), int(exact.sum()))
+
+
+def _tilted(
+    flat: _Fit,
+    here: NDArray[np.float64],
+    there: NDArray[np.float64],
+    heights_known: NDArray[np.bool_],
+    exact: NDArray[np.bool_],
+) -> _Fit:
+    """The flat fit, in three dimensions where positions allow it (`scale_from_gps`)."""
+    exact = exact & flat.inliers
+    accurate = int(exact.sum()) >= _FEWEST
+    chosen = exact if accurate else flat.inliers & heights_known
+    level = None if accurate else flat.metres * flat.turn
+    found = _fit_3d(here[chosen], there[chosen], level)
+    if found is None:
+        return flat
+    metres, turn = found
+    return replace(flat, metres=metres, turn=turn, spatial=int(chosen.sum()))
+
+
+def _report_fit(fit: _Fit, report: Report) -> None:
+    report.metric("gps_residual_m", round(fit.residual_m, 3))
+    report.metric("gps_agreeing", fit.agreeing)
 
 
 def _positions(
@@ -215,21 +272,19 @@ def _place(
     return EarthPlace(GEOGRAPHIC, around, EAST_DOWN_NORTH).beside(EAST_DOWN_NORTH.T @ shift)
 
 
-def _why_unused(
-    count: int, levelled: bool, factor: float, agreeing: int, residual: float, spread: float
-) -> str:
-    """Why so many positions cannot be used by the level of the cameras; "" if they can. Arguments
-    as in `scale_from_gps`."""
+def _why_unused(fit: _Fit, levelled: bool, spread: float) -> str:
+    """Why the flat fit cannot be used; "" if it can. spread: of the GPS positions, metres."""
+    count = len(fit.inliers)
     if count < _FEWEST:
         return f"{_FEWEST} photographs are needed"
     if not levelled:
         return "the up direction was not found"
-    if factor == 0:
+    if fit.metres == 0:
         return "most cameras or positions are at one place"
-    if agreeing < max(_FEWEST, _AGREEING_SHARE * count):
-        return f"only {agreeing} of them agree with the cameras"
-    if residual > _WORST_RESIDUAL * spread:
-        return f"they differ from the cameras by {residual:.1f} m (RMS)"
+    if fit.agreeing < max(_FEWEST, _AGREEING_SHARE * count):
+        return f"only {fit.agreeing} of them agree with the cameras"
+    if fit.residual_m > _WORST_RESIDUAL * spread:
+        return f"they differ from the cameras by {fit.residual_m:.1f} m (RMS)"
     return ""
 
 

@@ -122,7 +122,8 @@ class Job:
     def read(path: Path) -> Any:
         """The job that `write` wrote, of its own class."""
         stored = json.loads(path.read_text(encoding="utf-8"))
-        return _decoded(KINDS[stored["step"]], stored["job"])
+        kinds = {kind.step: kind for kind in Job.__subclasses__()}
+        return _decoded(kinds[stored["step"]], stored["job"])
 
 
 @dataclass(frozen=True)
@@ -236,15 +237,6 @@ class Triangulation(Job):
     out: Path
     cameras: KnownCameras
     refine: bool
-
-
-KINDS: dict[str, type[Job]] = {
-    kind.step: kind
-    for kind in (
-        *(Features, FeaturesChunk, Matching, PairSelection, MatchingChunk, Learned, Mapping),
-        *(Neighbours, Triangulation),
-    )
-}
 
 
 def _encoded(value: object) -> str:
