@@ -1,4 +1,4 @@
-"""The content of a camera file of any format, and the checks that all formats share.
+"""What every reader of a camera file returns, and the checks that all formats share.
 
 Cameras are in our conventions: world to camera, x right, y down, z forward. The world coordinates
 are the file's own; each module says what it changes.

@@ -1,8 +1,8 @@
 """The records of COLMAP's model files, binary and text: https://colmap.github.io/format.html.
 
-They are not read by pycolmap (4.2), which never returns from a truncated points file, and reads the
-lens of a truncated cameras file from uninitialised memory. Nothing is allocated by a count that the
-file claims.
+pycolmap (4.2) is not used: it never returns from a truncated points file, and reads the lens of a
+truncated cameras file from uninitialised memory. No memory is allocated by a count that a file
+claims.
 """
 
 from __future__ import annotations

@@ -32,8 +32,8 @@ def locate(path: Path) -> Path | None:
 
 
 def read(path: Path) -> CameraFile:
-    """The cameras of the pictures in a folder "images..." beside the file (that with the shortest
-    name), or beside the file itself. Raises SplatError "cameras-unreadable"."""
+    """The cameras. Pictures are in a folder "images..." beside the file (of several, the one with
+    the shortest name), or beside the file itself. Raises SplatError "cameras-unreadable"."""
     with reading(path, CAMERAS):
         rows = _rows(content_of(path))
         names = _names(path.parent, len(rows))

@@ -1,10 +1,11 @@
 """ODM's odm_report/shots.geojson, with the lenses of the project's cameras.json.
 
-`translation` is the centre of the camera in the projection of the project, metres east, north and
-up, less a whole number here; `rotation` is an axis-angle vector, world to camera with our axes, of
-the same world. The coordinates of the point are longitude, latitude and height. The file does not
-name its projection: it is the zone of UTM in which both agree. Focal lengths are in units of the
-longer side. Without cameras.json the lens is a pinhole of that focal length.
+`translation` is the centre of the camera in the projection of the project: metres east, north and
+up; reading subtracts a whole number. `rotation` is an axis-angle vector of the same world, world to
+camera with our axes. The coordinates of the point are longitude, latitude and height. The file does
+not name its projection: it is the zone of UTM in which coordinates and translations agree. Focal
+lengths are in units of the longer side. Without cameras.json the lens is a pinhole of that focal
+length.
 """
 
 from __future__ import annotations
@@ -82,7 +83,7 @@ def _optics(
     shot: dict[str, Any], lenses: dict[str, tuple[list[float], Lens]]
 ) -> tuple[list[float], Lens]:
     """(width, height, fx, fy, cx, cy in pixels; the lens) of a shot. Older files do not name the
-    camera: then it is that of the project, if it has one only."""
+    camera: then the project's only camera is meant."""
     size = [float(shot["width"]), float(shot["height"])]
     only = next(iter(lenses)) if len(lenses) == 1 else ""
     found = lenses.get(str(shot.get("camera", only)).removeprefix("v2 "))

@@ -24,8 +24,13 @@ from stages.cameras.camera_file import CameraFile, FilePoints
 
 @dataclass(frozen=True)
 class CameraFormat:
-    """A row of the list. module: in this package. description: for errors and help. suffix: of the
-    files that the format reads; "" if its module locates them."""
+    """A row of the list.
+
+    Args:
+        module: in this package.
+        description: for errors and help.
+        suffix: of the files that the format reads; "" if its module locates them.
+    """
 
     module: str
     description: str

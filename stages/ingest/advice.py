@@ -84,8 +84,8 @@ LEFT_OUT = {  # by code: what becomes of the first files that cannot be used, an
 
 
 def about_left_out(code: str, unusable: Sequence[tuple[str, str, str]], warn: Warn) -> None:
-    """Warn with a code of `LEFT_OUT`. unusable: (name, why, what to do) of photographs that cannot
-    be used, or whose depth maps cannot."""
+    """Warn with a code of `LEFT_OUT`. unusable: (name, why, what to do) of each photograph or depth
+    map that cannot be used."""
     first, others = LEFT_OUT[code]
     for name, why, hint in unusable[:_NAMED]:
         warn(code, f"{name} {first}: {why}. {hint}.")
@@ -195,8 +195,8 @@ def _counted(kinds: Counter[str]) -> str:
 def too_few(
     root: Path, usable: int, fewest: int, unusable: Sequence[tuple[str, str, str]]
 ) -> SplatError:
-    """The error of a capture `root` with too few usable photographs. fewest: that are wanted.
-    unusable: as for `about_left_out`."""
+    """The error of a capture in `root` with too few usable photographs. fewest: how many it needs.
+    unusable: as in `about_left_out`."""
     if root.is_file() and unusable:
         return SplatError(
             "ingest-video-unusable",

@@ -1,7 +1,7 @@
 """Decodes a photograph of any supported format to upright 8-bit sRGB of limited size.
 
-Also: what is wrong with a JPEG that decoders accept without a word: they fill what is missing with
-grey, and walk over the whole picture for each of any number of scans.
+JPEG files are checked first, because decoders accept faults without an error: they fill missing
+parts with grey, and go over the whole picture once for each scan, however many a file has.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ UPRIGHT = {
 
 
 class Unusable(Exception):  # noqa: N818 - a finding about a file, not a failure
-    """A file that cannot be used. The message says why, as what follows "name: "; hint says what to
-    do, as a sentence without its full stop."""
+    """A file that cannot be used. The message says why and is printed after "name: ". hint: what to
+    do, a sentence without its full stop."""
 
     def __init__(self, why: str, hint: str = COPY_AGAIN) -> None:
         super().__init__(why)
@@ -280,7 +280,7 @@ def _resized(image: Image.Image, size: tuple[int, int], stored: tuple[int, int])
 
 
 def _in_srgb(image: Image.Image, profile: bytes | None) -> tuple[Image.Image, bool]:
-    """(the picture in sRGB, itself if that changes nothing; whether its profile is unusable)."""
+    """(the picture in sRGB, itself if nothing changes; whether its profile is damaged)."""
     try:
         return colour.icc_to_srgb(image, profile) if profile else image, False
     except (ImageCms.PyCMSError, OSError, ValueError, TypeError):
@@ -307,7 +307,7 @@ _START, _END, _SCAN, _TEM = 0xD8, 0xD9, 0xDA, 0x01
 
 def jpeg_fault(data: bytes) -> str:
     """Why the first image in `data` is refused: it lacks its end-of-image marker (ITU-T T.81, annex
-    B), or has very many scans. "" if it is well.
+    B), or has very many scans. "" if nothing is wrong.
 
     Walks over the segments, so that an end marker within a thumbnail or a comment does not count.
     """

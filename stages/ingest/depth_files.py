@@ -1,9 +1,9 @@
 """Measured depth beside photographs: which file belongs to which photograph, and what it holds.
 
 Read are 16-bit PNG and TIFF (millimetres), and TIFF, EXR and .npy of floating-point numbers
-(metres): the depth along the camera's axis (z). 0, NaN and the largest number of 16 bits say that
+(metres): the depth along the camera's axis (z). 0, NaN and the largest number of 16 bits mean that
 nothing was measured. A transforms.json of nerfstudio's names a map for each photograph, and the
-metres of one step of all. Apps of phones write how confident they are, in three levels; only the
+metres of one step of their values. Apps of phones write their confidence in three levels; only the
 highest is used.
 """
 
@@ -81,8 +81,8 @@ def pair_depths(
 
 
 def needs_no_photograph(name: str, files: Container[str]) -> bool:
-    """Whether a map in the photographs' folder is of a frame of 3D Scanner App, of which not every
-    one has a picture: `files` then holds that frame's .json."""
+    """Whether a map in the photographs' folder belongs to a frame of 3D Scanner App: then `files`
+    holds the frame's .json. The app writes pictures for some of its frames only."""
     return f"{_of_frame(name).rpartition('.')[0]}.json" in files
 
 

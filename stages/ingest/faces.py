@@ -39,8 +39,8 @@ def face_photos(photo: Photo, masked: MaskedPhoto) -> Iterator[tuple[Photo, Mask
     """The faces of a panorama as photographs, with their pictures and masks; `photo` and `masked`
     are of the whole.
 
-    They are square and have as many pixels a degree as its horizon has. Those that the mask leaves
-    nothing of are left out.
+    They are square and have as many pixels a degree as the panorama's horizon. Faces that the mask
+    covers are left out.
     """
     pixels = masked.decoded.pixels
     height, width = pixels.shape[:2]
@@ -96,7 +96,8 @@ def face_rotation(yaw_deg: float, pitch_deg: float) -> NDArray[np.float64]:
 
 
 def _continued(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """With a margin: over the seam goes on the other side; beyond a pole, the last row is close."""
+    """The picture with a margin: from its other side beyond the seam, and the last row again
+    beyond a pole."""
     sides = (0, 0, _MARGIN, _MARGIN)
     wrapped = cv2.copyMakeBorder(picture, *sides, cv2.BORDER_WRAP)
     sides = (_MARGIN, _MARGIN, 0, 0)

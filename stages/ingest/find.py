@@ -84,8 +84,8 @@ def find(folder: Path, more_masks: Path | None = None, depth: Path | None = None
 
 
 def _posed(folder: Path, pictures: list[str]) -> list[str]:
-    """The pictures that the camera files of a synthetic NeRF scene name, where the folder holds
-    such files and pictures: what lies beside these are maps of depth and of normals."""
+    """The pictures that the camera files of a synthetic NeRF scene name; other pictures beside them
+    are maps of depth and normals. All pictures where the folder is no such scene."""
     named: set[str] = set()
     if blender.locate(folder) is not None:
         with suppress(SplatError):
@@ -94,8 +94,8 @@ def _posed(folder: Path, pictures: list[str]) -> list[str]:
 
 
 def _without_pictures_of_scans(files: Iterable[str], pictures: list[str]) -> list[str]:
-    """The pictures without those that 3D Scanner App puts beside its frames, a small copy of one
-    and the texture of its mesh: in a folder with pictures of frames, each has its frame_*.json."""
+    """The pictures without the two that 3D Scanner App puts beside its frames: a small copy of one
+    frame, and the texture of the mesh. In such a folder each frame has its frame_*.json."""
     frames = {name.rpartition(".")[0] for name in files if _FRAME.search(name)}
     of_frames = (name for name in pictures if name.rpartition(".")[0] in frames)
     scans = {name.rpartition("/")[0] for name in of_frames}

@@ -1,8 +1,8 @@
-"""Which pinhole pictures, the faces, together show what a wide fisheye photograph shows.
+"""Chooses pinhole pictures (faces) that together show what a wide fisheye photograph shows.
 
 One pinhole picture sees 60 degrees to either side of its axis. Where it would lose more than a
-quarter of the field of view, two of them side by side show it, or else the faces of a cube in front
-of the camera. All have the photograph's position, its focal length and known turns.
+quarter of the field of view, two faces side by side are used, or the faces of a cube in front of
+the camera. All have the photograph's position, its focal length and known turns.
 """
 
 from __future__ import annotations

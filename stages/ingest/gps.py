@@ -57,7 +57,7 @@ def read_gps(tags: dict[int, Any], xmp: bytes) -> Gps:
 
 
 def _from_exif(tags: dict[int, Any]) -> Gps:
-    """None also at 0, 0, which receivers without a fix write."""
+    """The position; none at 0, 0 either, which receivers without a fix write."""
     found = []
     for reference, number in ((1, 2), (3, 4)):
         sign = {"N": 1, "E": 1, "S": -1, "W": -1}.get(text_of(tags.get(reference)).upper()[:1])

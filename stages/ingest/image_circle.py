@@ -1,4 +1,4 @@
-"""Finds the image circle of a fisheye: beyond it, every photograph of the lens is as dark as its
+"""Finds the image circle of a fisheye lens: outside it, all photographs are as dark as in their
 corners."""
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ _MARGIN = 0.01  # of the radius, for the blurred rim
 
 
 def brightest(pictures: Iterable[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    """[h, w] the brightest value of each pixel in any channel of any picture [H, W, 3], small. At
-    least one picture."""
+    """[h, w] the largest value of each pixel over all channels of one or more pictures [H, W, 3],
+    scaled down."""
     small = [_reduced(picture) for picture in pictures]
     return np.asarray(np.max(small, axis=0), np.uint8)
 

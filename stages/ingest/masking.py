@@ -81,7 +81,8 @@ class MaskedPhoto:
         return cls(decoded, mask, outside, scaled)
 
     def without(self, file: Path, name: str) -> MaskedPhoto:
-        """Without what the mask in `file` is black at. Raises SplatError "mask-unfit"."""
+        """The photograph without the parts where the mask in `file` is black. Raises SplatError
+        "mask-unfit"."""
         kept, scaled = _read(file, name, False, self.decoded)
         mask = np.where(kept, np.uint8(255) if self.mask is None else self.mask, np.uint8(0))
         return MaskedPhoto(self.decoded, mask, IGNORE, self.scaled or scaled)
@@ -93,10 +94,10 @@ class MaskedPhoto:
 
 def cuts_out_object(masks: Sequence[Path], invert: bool) -> bool:
     """Whether the masks of a capture keep one object that stands free in nearly every photograph,
-    and are not those of a lens.
+    and not the circle of a lens.
 
-    Around an object cut out, nothing is known of the rest in any view: splats there would hide
-    nothing and be seen from everywhere, as fog.
+    No view says anything about the space around such an object: splats there would be seen from
+    everywhere, as fog.
 
     Args:
         masks: files, one for each photograph; unreadable ones do not count.
@@ -170,7 +171,7 @@ def _read(path: Path, name: str, invert: bool, decoded: Decoded) -> tuple[NDArra
 
 def turned_with(image: Image.Image, decoded: Decoded) -> tuple[Image.Image, str]:
     """(a mask or a depth map, turned upright with its photograph if it has the orientation of the
-    stored file; both sizes in words if their proportions differ even so, else "")."""
+    stored file; "", or both sizes in words if their proportions still differ)."""
     upright, stored = decoded.upright, decoded.stored
     if _same_aspect(image.size, upright):
         return image, ""

@@ -19,8 +19,8 @@ def mask_folder(photos: Path, chosen: Path | None) -> Path | None:
 
 
 def check_rig_mask(file: Path | None) -> None:
-    """Raises SplatError "file-missing" if the mask of all panoramas was given and is no file: where
-    no picture is a panorama it would never be opened."""
+    """Raises SplatError "file-missing" if the mask for all panoramas is no file. Checked at once,
+    because it is opened only when there is a panorama."""
     if file is not None and not file.is_file():
         raise SplatError(
             "file-missing",

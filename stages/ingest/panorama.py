@@ -1,9 +1,9 @@
 """Recognises 360-degree pictures, which no perspective camera describes.
 
-By the metadata of Google's photo sphere (GPano), or by what an equirectangular picture of the whole
-sphere cannot avoid: it is exactly twice as wide as high, its left edge goes on at its right edge,
-and its first and its last row are one point of the sphere each. Twice as wide as high alone says
-nothing: phones take such photographs.
+Google's photo sphere metadata (GPano) decides where a picture has it. Otherwise an equirectangular
+picture of the whole sphere is recognised by its shape and edges: it is exactly twice as wide as
+high, its left edge continues its right edge, and its first and last rows are uniform, because each
+is one point of the sphere. The shape alone says nothing: phones take such photographs.
 """
 
 from __future__ import annotations
@@ -73,12 +73,12 @@ def hint_for(kind: str) -> str:
 
 
 def _reduced(pixels: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """[H, W] mean of the channels over blocks, at most about `_COLUMNS` wide; the borders stay."""
+    """[H, W] mean of the channels over tiles, at most about `_COLUMNS` wide; the borders stay."""
     step = max(1, pixels.shape[1] // _COLUMNS)
     height, width = (side // step * step for side in pixels.shape[:2])
     grey = pixels[:height, :width].mean(axis=2)
-    blocks: NDArray[np.float64] = grey.reshape(height // step, step, width // step, step)
-    return np.asarray(blocks.mean(axis=(1, 3)))
+    tiles: NDArray[np.float64] = grey.reshape(height // step, step, width // step, step)
+    return np.asarray(tiles.mean(axis=(1, 3)))
 
 
 def _wraps(grey: NDArray[np.float64]) -> bool:

@@ -50,11 +50,11 @@ def measure(pixels: NDArray[np.uint8], mask: NDArray[np.uint8] | None = None) ->
     size = fitted_size(width, height, MEASURED_SIDE_PX)
     small = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
     grey = np.asarray(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), np.uint8)
-    light = luminance(small)
+    values = luminance(small)
     if mask is not None:
         inside = cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST) > 0
-        light = light[inside] if inside.any() else light
-    median = float(np.median(light))
+        values = values[inside] if inside.any() else values
+    median = float(np.median(values))
     return Measures(
         sharpness=float(f"{sharpness(grey):.5g}"),
         log2_luminance=round(float(np.log2(max(median, 2.0**-14))), 3),

@@ -1,4 +1,4 @@
-"""Settings of reading photographs. Neither NumPy nor torch is imported for them."""
+"""Settings of reading photographs. Imports neither NumPy nor torch."""
 
 from __future__ import annotations
 

@@ -61,9 +61,9 @@ class Findings:
     Args:
         sources: photographs, by their names' endings, in natural order.
         videos: to take frames from.
-        raws, other_pictures: names of files that are not read. Like `videos` without those that
-            share their name with a photograph (IMG_1.NEF, or a live picture's IMG_1.MOV, beside
-            IMG_1.JPG).
+        raws, other_pictures: names of files that are not read. These and `videos` leave out files
+            that share their name with a photograph (IMG_1.NEF, or a live picture's IMG_1.MOV,
+            beside IMG_1.JPG).
         beside_frames: names of pictures beside the frames of a 3D Scanner App scan, which are no
             photographs.
         others: how many files are something else.

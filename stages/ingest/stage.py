@@ -1,4 +1,4 @@
-"""Stage 1: photographs -> Capture, each as upright 8-bit sRGB with what EXIF says of it.
+"""Stage 1: photographs -> Capture: upright 8-bit sRGB pictures, and what EXIF says about them.
 
 Reads JPEG, PNG, TIFF, WebP, HEIC, AVIF and BMP from a folder and its sub-folders, in which nothing
 is written, and takes sharp frames from videos. Warnings say what a photographer should change.
@@ -207,7 +207,8 @@ def _ingest_photograph(
 
 
 def _with_depth(done: _Ingested, file: DepthFile, decoded: Decoded, folder: Path) -> _Ingested:
-    """The photograph with its depth map, which is written, or with why that cannot be used."""
+    """Write the depth map of a photograph; returns the photograph with it, or with the reason why
+    the map cannot be used."""
     photo = done.photos[0]
     place = f"{FOLDERS[0]}/{photo.picture}.npy"
     try:

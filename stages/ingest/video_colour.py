@@ -95,8 +95,8 @@ def _encoded_rgb(frame: Any, colours: Colours, width: int, height: int) -> NDArr
     """[H, W, 3] non-linear R'G'B' in the video's own encoding, nominally 0 to 1."""
     name, bits = frame.format.name, frame.format.components[0].bits
     if not name.startswith(("yuv", "nv", "p0", "p2", "uyvy", "yuyv")):  # RGB, grey, a palette
-        plain = frame.reformat(width, height, "rgb48le", interpolation="LANCZOS")
-        return np.asarray(plain.to_ndarray() / 65535, np.float32)
+        rgb = frame.reformat(width, height, "rgb48le", interpolation="LANCZOS")
+        return np.asarray(rgb.to_ndarray() / 65535, np.float32)
     deep = bits > 8
     full = name.startswith("yuvj") or colours.range == _FULL_RANGE
     planar = "yuv444p16le" if deep else "yuvj444p" if name.startswith("yuvj") else "yuv444p"
@@ -126,9 +126,9 @@ def _default_matrix(frame: Any, colours: Colours) -> int:
 
 def _tone_mapped(transfer: int, signal: NDArray[np.float64]) -> NDArray[np.float64]:
     """[..., 3] linear BT.2020 of an SDR display, 1 its white, from an HDR signal [..., 3]."""
-    light = pq_eotf(signal) if transfer == _PQ else hlg_eotf(signal)
-    brightest = light.max(axis=-1, keepdims=True)
-    return np.asarray(light * eetf(brightest) / np.maximum(brightest, 1e-6) / WHITE)
+    linear = pq_eotf(signal) if transfer == _PQ else hlg_eotf(signal)
+    brightest = linear.max(axis=-1, keepdims=True)
+    return np.asarray(linear * eetf(brightest) / np.maximum(brightest, 1e-6) / WHITE)
 
 
 def pq_eotf(signal: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -138,8 +138,8 @@ def pq_eotf(signal: NDArray[np.float64]) -> NDArray[np.float64]:
     return 10_000.0 * ratio ** (16384 / 2610)
 
 
-def _pq_inverse_eotf(light: NDArray[np.float64]) -> NDArray[np.float64]:
-    power = (light / 10_000.0) ** (2610 / 16384)
+def _pq_inverse_eotf(linear: NDArray[np.float64]) -> NDArray[np.float64]:
+    power = (linear / 10_000.0) ** (2610 / 16384)
     return np.asarray(
         ((3424 / 4096 + 2413 / 128 * power) / (1 + 2392 / 128 * power)) ** (2523 / 32)
     )
@@ -154,11 +154,11 @@ def hlg_eotf(signal: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(PEAK * np.maximum(luminance, 0.0)[..., None] ** 0.2 * scene)
 
 
-def eetf(light: NDArray[np.float64]) -> NDArray[np.float64]:
+def eetf(linear: NDArray[np.float64]) -> NDArray[np.float64]:
     """Tone mapping of cd/m2 from `PEAK` to `WHITE`, without change of dark colours: the EETF of
     BT.2390, section 5.4.1, a Hermite spline above its knee."""
     peak, white = _pq_inverse_eotf(np.array([PEAK, WHITE]))
-    signal = np.minimum(_pq_inverse_eotf(light) / peak, 1.0)
+    signal = np.minimum(_pq_inverse_eotf(linear) / peak, 1.0)
     most = white / peak
     knee = 1.5 * most - 0.5
     t = np.clip((signal - knee) / (1 - knee), 0.0, 1.0)

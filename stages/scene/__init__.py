@@ -3,6 +3,11 @@
 World: right-handed, y down (up = -Y), as in COLMAP and in the .ply files that viewers read;
 recentred in float64. Camera: x right, y down, z forward; pixel centres at +0.5. Colour =
 max(0, 0.5 + SH), in the photographs' own sRGB values. Images: [H, W, 3] float32 in [0, 1].
+
+In reading order: `capture` (photographs and what is found from them), `camera`, `splats`,
+`draw_settings` (how splats are drawn), `assets`, `mesh`, `place` (on the earth); on disk, `storage`
+and `pictures`; and what works on these types: `rotations`, `light`, `framing`, `quantiles`,
+`morton`, `recentring`, `flip`.
 """
 
 from stages.scene.assets import ExportedAssets, ExportedFile

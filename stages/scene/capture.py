@@ -38,8 +38,7 @@ class Face:
 
 @dataclass(frozen=True)
 class Photo:
-    """One usable photograph, or one face of a panorama, as ingest wrote it; or one face of a
-    photograph with a wide fisheye.
+    """One usable photograph, or one face of a panorama or wide fisheye photograph.
 
     Args:
         name: the user's own relative path in posix style ("day 1/IMG_01.HEIC"); of a
@@ -164,8 +163,8 @@ class Reconstruction:
         units: "metres", or "arbitrary" if the scale of the scene is unknown.
         place: where the world is on the earth; None if that is unknown.
         levelled: whether the up direction (-Y) was found from the cameras.
-        light_explained: by which share the variance of a point's values over its views falls when
-            the lights of the views are corrected.
+        light_explained: how much of the variance of a point's values over its views disappears when
+            the lights of the views are corrected: 0 to 1.
     """
 
     folder: Path
@@ -188,8 +187,8 @@ class Reconstruction:
 
 
 def split_held_out(views: tuple[View, ...]) -> tuple[tuple[View, ...], tuple[View, ...]]:
-    """(training views, held-out test views): the first of every eight views by name is held out and
-    used for evaluation only. Where views have roles, those with the role "test" are.
+    """(training views, held-out test views). Held out, for evaluation only, is the first of every
+    eight views by name; where views have roles, those with the role "test".
 
     A near-duplicate of another view would measure how well that other view was learnt, so the first
     of the eight that is no near-duplicate is held out instead. With fewer than 4 views nothing is.

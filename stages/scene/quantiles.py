@@ -1,7 +1,4 @@
-"""Quantiles of many points, one axis at a time to save memory.
-
-Also: the distance between neighbouring splats: the unit in which errors of positions are seen.
-"""
+"""Statistics of many points: quantiles, one axis at a time to save memory, and their spacing."""
 
 from __future__ import annotations
 
@@ -28,9 +25,9 @@ _SAMPLE = 20_000  # centres whose nearest neighbour is searched
 
 
 def median_spacing(means: NDArray[np.floating]) -> float:
-    """The median distance of a centre of means [N, 3] to its nearest neighbour, of centres that
-    coincide with no other; 0 if there are no such centres. A sample of the centres is searched
-    for, among all."""
+    """The median distance from a centre of means [N, 3] to its nearest neighbour: errors of
+    positions are visible in units of it. Centres that coincide with another do not count; 0 if none
+    is left. The median is over a sample of the centres."""
     if len(means) < 2:
         return 0.0
     sample = means[:: max(1, len(means) // _SAMPLE)]

@@ -15,7 +15,7 @@ _FAR_SPREADS, _FAR_UNITS = 1000.0, 1000.0
 def recentred(
     means: NDArray[np.float64], origin: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """(means [N, 3] float32, origin [3]) with the same sum as the arguments.
+    """(means [N, 3] float32, origin [3]) whose sum is that of the arguments.
 
     Means that are far from zero for their spread are moved near zero by whole units; others are
     unchanged. A value too large for float32 becomes infinite.

@@ -1,7 +1,4 @@
-"""Rotation matrices and unit quaternions w, x, y, z of the same rotations.
-
-Also: the similarity transform between two sets of corresponding points.
-"""
+"""Rotation matrices, unit quaternions w, x, y, z, and similarity transforms between points."""
 
 from __future__ import annotations
 

@@ -129,13 +129,16 @@ class TrainedSplats:
 class QuantisedSplats:
     """Splats as decided for export: what was kept, and at which precision.
 
-    splats: the values to export, SH already cut to the degree decided for each splat.
-    sog_bits: bit depth by attribute of a .sog; None where no .sog was requested.
-    flat_dc [N, 3]: DC coefficients for formats without view-dependent colour; None where those of
-    the splats do. finetuned: by format that rounds its values, the splats that its file should
-    hold, fine-tuned to that rounding. plain: the splats for formats that are drawn without opacity
-    compensation; None where `splats` are drawn without it, or no such format was requested.
-    drawing: which formats these are, see `formats.table.Format.holds_antialiased`.
+    Args:
+        splats: the values to export, SH already cut to the degree decided for each splat.
+        sog_bits: bit depth by attribute of a .sog; None where no .sog was requested.
+        flat_dc: [N, 3] DC coefficients for formats without view-dependent colour; None where those
+            of the splats serve.
+        finetuned: for each format that rounds values, the splats that its file should hold,
+            fine-tuned to that rounding.
+        plain: the splats for formats that are drawn without opacity compensation; None where
+            `splats` are drawn without it, or no such format was requested.
+        drawing: which formats these are, see `formats.table.Format.holds_antialiased`.
     """
 
     splats: Splats

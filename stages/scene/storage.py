@@ -1,10 +1,9 @@
 """Splats on disk between stages: exact, deterministic, and quick to load.
 
-Layout: the 8 bytes of `MAGIC`, then one block in NumPy's .npy format (version 1.0) for each array
-in the order of `FIELDS`, and one for the draw settings: those of `DrawSettings`.
-Where the splats have a place on the earth, a last one holds its JSON in UTF-8. There is no
-compression and no timestamp (a zip file, and so .npz, would have them), so equal splats give equal
-bytes.
+Layout: the 8 bytes of `MAGIC`, then each array in the order of `FIELDS` and one for `DrawSettings`,
+in NumPy's .npy format (version 1.0). Where the splats have a place on the earth, a last array holds
+its JSON in UTF-8. There is no compression and no timestamp (a zip file, and so .npz, would have
+them), so equal splats give equal bytes.
 """
 
 from __future__ import annotations
@@ -83,7 +82,7 @@ def _file_of(path: Path) -> Path:
 
 
 def _read_array(file: BinaryIO, file_bytes: int, name: str) -> NDArray[np.generic]:
-    """One .npy block; its size is checked against the file before memory is allocated."""
+    """One array in .npy format; its size is checked against the file before memory is allocated."""
     if npy.read_magic(file) != (1, 0):
         raise ValueError(f"{name} has another version")
     try:

@@ -1,1 +1,6 @@
-"""Stage 3: `Reconstruction` -> the first `Splats`: at sparse points, and where there are none."""
+"""Stage 3: `Reconstruction` -> the first `Splats`: at sparse points, and where there are none.
+
+In reading order: `settings`, `stage`, `view_selection` (which views are used), `plane_sweep` and
+`measured_depth` (more points), `empty_cells` (splats where there are still none), `visibility`
+(may a surface be there?), `projection` and `neighbours`.
+"""

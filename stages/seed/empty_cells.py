@@ -1,6 +1,6 @@
 """Initial splats where structure from motion found no points.
 
-Plain walls, blurred backgrounds and the borders of a capture have no features, so a start from the
+Bare walls, blurred backgrounds and the borders of a capture have no features, so a start from the
 sparse points alone leaves holes that training fills slowly or never. Here each photograph is
 divided into cells. A cell without points gets one, at a depth interpolated from its neighbours in
 that photograph and in its own colour. Photographs are processed in order, and points added for one
@@ -64,7 +64,7 @@ def fill_cells(
 
     Args:
         folder: folder that the views' image paths are relative to.
-        views: training views of which the cells are filled.
+        views: training views whose cells are filled.
         points: [P, 3].
         cameras: of all views; no point is added close to them.
         training: all training views, `views` if left out: beyond its borders a photograph is

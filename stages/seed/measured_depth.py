@@ -1,9 +1,9 @@
 """Points from measured depth, where structure from motion and the plane sweep found none.
 
-The maps are in metres, the world often is not: one scale for all of them is the median ratio of the
-sparse points' depths to those measured at their pixels. A map that differs from the points after
-that is not used. Pixels at edges mix two surfaces and are left out, and so is a position that
-another map sees through. What several maps measure is averaged.
+The maps are in metres, the world often is not. So all maps are scaled by one factor: the median
+ratio of the sparse points' depths to the depths measured at their pixels. A map that still differs
+from the points is not used. Left out are pixels at edges, which mix two surfaces, and positions
+that another map sees through. Where several maps measure the same surface, their mean is used.
 """
 
 from __future__ import annotations
@@ -108,8 +108,8 @@ def _scaled(
 def _fused(
     one: DepthMap, others: list[DepthMap]
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """(mean position [h, w, 3] of what maps measure at each pixel, how many these are [h, w]: 0
-    where this one does not, or another sees through it)."""
+    """(mean position [h, w, 3] over the maps that measure the surface at each pixel, their number
+    [h, w]). The number is 0 where this map has no value, or where another sees through it."""
     rows, columns = np.nonzero(one.ncc > 0)
     depths = one.depth[rows, columns].astype(np.float64)
     own = unproject(one.camera, pixel_centres(rows, columns), depths)

@@ -41,7 +41,7 @@ SAME_SURFACE = 0.05  # relative depth difference
 
 @dataclass(frozen=True)
 class DepthMap:
-    """Of one reference view: depth [H, W], and NCC [H, W], -1 without an estimate."""
+    """The depth map of a reference view: depth [H, W], and NCC [H, W], -1 without an estimate."""
 
     camera: Camera
     depth: NDArray[np.float32]

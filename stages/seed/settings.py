@@ -1,4 +1,4 @@
-"""Settings of the first splats. Neither NumPy nor torch is imported for them."""
+"""Settings of the first splats. Imports neither NumPy nor torch."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Stage 3: Reconstruction -> Splats: initial splats from the sparse points, without outliers.
+"""Stage 3: Reconstruction -> Splats: initial splats at sparse points, and where there are none.
 
 Follows the reference trainer (Kerbl et al., 3D Gaussian Splatting, 2023, section 5.1): one round
-splat a point, as large as the mean distance to its three nearest neighbours, opacity 0.1. Points of
-a plane sweep, measured depth and filled cells are added (`seed`).
+splat a point, as large as the mean distance to its three nearest neighbours, opacity 0.1. Outliers
+are left out; points of a plane sweep, measured depth and filled cells are added.
 """
 
 from __future__ import annotations

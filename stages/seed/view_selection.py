@@ -1,8 +1,8 @@
-"""From which views splats are seeded, and which other views a plane sweep compares each with.
+"""Selects the views that splats are seeded from, and the source views of each for a plane sweep.
 
-Both follow from the rays to a sample of the sparse points. Of many views a part is enough: one that
-sees many points from directions from which no chosen view sees them, with its source views, then
-the next. The time for seeding is therefore bounded.
+Both follow from the rays to a sample of the sparse points. A part of many views is enough, which
+bounds the time. Views are chosen one after the other, each with its source views: the next is the
+one that sees most points from directions that no chosen view has.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SAMPLE = 1000  # sparse points by which views are selected
 
 
 class Observations:
-    """Which of a sample [P] of the sparse points each of the cameras [V] sees, and from where.
+    """Which of P sampled sparse points each of V cameras sees, and from where.
 
     visible [V, P]; rays [V, P, 3] from the camera to the point, of length 1.
     """

@@ -1,8 +1,8 @@
-"""Visibility constraints: whether the points that other photographs see support a surface at a
-position, or show that its line of sight is free.
+"""Visibility constraints: may there be a surface at a position?
 
-A position with a point of about its depth around it in a picture is supported there. If all points
-around it are farther away, it would occlude them: free space, in which splats would be floaters.
+In the picture of another photograph, a position is supported if a point near it has about its
+depth. If all points near it are farther away, it would occlude them: it lies in free space, where
+splats would be floaters.
 """
 
 from __future__ import annotations

@@ -1,16 +1,18 @@
 """Stage 2: `Capture` -> `Reconstruction`: structure from motion by COLMAP, or known cameras.
 
-Without known cameras (`stage`):
-- `checks.fallbacks` lists the configurations and tries them; `checks.attempt_runner` runs one of
-  them as jobs (`worker.job`) in worker processes (`worker.process`), or in `worker.chunks`;
-- in the worker: `features` (SIFT), then pairs by `retrieval` over a `vocabulary` of visual words
-  and `pairs`, `matching` with `descriptor_matching` and two-view geometry, then `mapping`;
-- where SIFT leaves photographs out: `learned`;
-- `worker.sparse_model` holds the result with its statistics, `checks.gates` check them, and
-  `checks.acceptance` decides which model is used.
+In reading order, without known cameras:
+- `settings`, `stage`: the options; the stage from its input to its files.
+- `checks.fallbacks` lists configurations and tries them; `checks.attempt_runner` runs one of them.
+- `worker.process` runs one step (`worker.job`) in a process of its own; `worker.chunks` splits the
+  first steps for executors.
+- In that process: `worker.features` (SIFT), then pairs of photographs by `worker.retrieval` over a
+  `worker.vocabulary` and by `worker.pairs`, `worker.matching`, and `worker.mapping`.
+- `learned`: features for the photographs that SIFT leaves out.
+- `worker.sparse_model` holds the result; `checks.statistics` measures it, `checks.gates` refuse it,
+  and `checks.acceptance` decides which attempt is used.
 
 With known cameras: `known`.
 
-Both end in `finish`: `place.levelling`, `place.metric_scale` and `undistorted_images`; then `light`
-measures exposure and vignetting, and `reconstruction_files` stores the result.
+Both end in `finish`: `place` finds up, scale and north, and `undistorted_images` writes pictures.
+Then `light` measures exposure and vignetting, and `reconstruction_files` stores the result.
 """

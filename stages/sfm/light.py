@@ -1,9 +1,9 @@
 """Exposure and white balance of each photograph, and vignetting of each camera, from points that
 several photographs show.
 
-All add to the logarithm of an sRGB value plus 0.055 (`scene.light`). So they are the solution of
-one linear system: a point that is seen near the centre of one photograph and near the border of
-another is an equation for vignetting.
+Each of them adds to the logarithm of an sRGB value plus 0.055 (`scene.light`). So one linear system
+gives them all: a point that is near the centre of one photograph and near the border of another is
+an equation for vignetting.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ LEAST_AGREEMENT = 0.75  # of vignetting fitted to one side of the picture, x tha
 
 @dataclass(frozen=True)
 class MeasuredLight:
-    """What `measure_light` found; EV.
+    """What `measure_light` measures, in EV.
 
     Args:
         light: [V, 3] by how much each photograph is lighter than the median one in red, green and
             blue; NaN for a view with too few usable points.
-        explained: by which share the variance of a point's values over its views falls when they
-            are corrected by `light` (robust: of the median absolute deviations). Exposure explains
-            most of it; of surfaces that shine it explains little.
+        explained: how much of the variance of a point's values over its views disappears when they
+            are corrected by `light`: 1 for all of it. Low for surfaces that shine. Variance is
+            measured by median absolute deviations.
         vignetting: [V, 3] of the camera of each view (`scene.light`); 0 where none was found.
-        vignetting_explained: by which share that variance falls further when vignetting is
-            corrected, too.
+        vignetting_explained: how much of the variance that is left then disappears when vignetting
+            is corrected, too.
     """
 
     light: NDArray[np.float64]
@@ -117,12 +117,12 @@ def measure_light(
     place = (px - place[:, :2]) / place[:, 2:]
     vignetting = _vignetting(points, views, ev.mean(axis=1), place, _numbers_of_cameras(cameras))
     darker = (powers_of_radius((place**2).sum(axis=1)) * vignetting[views]).sum(axis=1)
-    plain, ev = ev, ev + darker[:, None]
+    vignetted, ev = ev, ev + darker[:, None]
     seen, shown = np.unique(views), _indicators(views, len(pictures))
     offsets = np.array([_solution(points, channel, shown) for channel in ev.T]).T
     light[seen] = offsets[seen] - np.median(offsets[seen], axis=0)
     before, after = _variance(points, ev), _variance(points, ev - light[views])
-    uncorrected = _variance(points, plain - light[views])
+    uncorrected = _variance(points, vignetted - light[views])
     return MeasuredLight(
         light,
         1.0 - after / before if before else 0.0,
@@ -144,9 +144,8 @@ def _vignetting(
     place: NDArray[np.float64],
     cameras: NDArray[np.intp],
 ) -> NDArray[np.float64]:
-    """[V, 3] vignetting of each view; 0 for a camera where it is small, or not about the same in
-    the left and right halves and the upper and lower halves of its pictures, as shading of the
-    scene is not.
+    """[V, 3] vignetting of each view. 0 for a camera where it is small, and where the halves of the
+    pictures (left and right, upper and lower) disagree about it: then it is shading of the scene.
 
     Args:
         points, views, ev: [O] observations and their values.

@@ -1,4 +1,4 @@
-"""Settings of structure from motion. Neither NumPy nor torch is imported for them."""
+"""Settings of structure from motion. Imports neither NumPy nor torch."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ class PosedPhoto:
 
     @property
     def optics(self) -> tuple[object, ...]:
-        """Lens, size and intrinsics: equal for photographs of which one undistortion serves."""
+        """Lens, size and intrinsics: equal for photographs that are undistorted in the same way."""
         c = self.camera
         return self.lens, c.width, c.height, c.fx, c.fy, c.cx, c.cy
 

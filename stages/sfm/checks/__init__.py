@@ -1,1 +1,6 @@
-"""Configurations and their attempts, the gates that a result must pass, which one is accepted."""
+"""What to try, and whether the result is good enough.
+
+In reading order: `fallbacks` (the configurations and their order), `attempt_runner` (runs one),
+`statistics` (measures its model), `gates` (thresholds, and the errors behind them), `acceptance`
+(which attempt is used, and what is reported about it).
+"""

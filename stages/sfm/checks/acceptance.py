@@ -1,4 +1,4 @@
-"""Which model of the attempts is used; the error if there is none, and the warnings if there is."""
+"""Which attempt is used, or the error if none can be; warnings and metrics about it."""
 
 from __future__ import annotations
 

@@ -198,8 +198,8 @@ class AttemptRunner:
         return project
 
     def _unregistered(self, database: Path) -> tuple[int, ...]:
-        """Positions of the photographs that SIFT left out: of its model, or where mapping was not
-        reached, of the largest group that its matches link."""
+        """Positions of the photographs that SIFT left out of its model; where there is no model,
+        those outside the largest group that its matches link."""
         all_names = self.project.photographs.names
         model_folder = self._model_folder(CONFIGURATIONS[0])
         registered: set[int] = set()

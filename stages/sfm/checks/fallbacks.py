@@ -74,7 +74,7 @@ class Attempt:
         result: of mapping; nothing if it was not reached.
         keypoints_median: per photograph.
         pairs_matched: pairs whose features were matched.
-        pairs_verified: those of them with a two-view geometry.
+        pairs_verified: pairs with a two-view geometry.
     """
 
     configuration: Configuration
@@ -97,8 +97,9 @@ class Attempt:
 
     @property
     def rank(self) -> tuple[bool, int, int, int]:
-        """Orders attempts that failed: models that learned features may have joined falsely are the
-        last, then by registered photographs, points, and the size of any model found."""
+        """Orders attempts that failed, the best highest: by registered photographs, then by points,
+        then by the largest model. Models that learned features may have joined falsely are below
+        all others."""
         largest = max(self.statistics.models, default=0)
         failures = {failure.code for failure in self.failures}
         false = self.configuration.learned and bool(failures & _FALSE_JOIN)
@@ -106,9 +107,9 @@ class Attempt:
 
 
 def best_attempt(attempts: list[Attempt]) -> Attempt:
-    """The attempt that passed with most registered photographs, the first of them; if none passed,
-    the one of the highest rank. Of the standard model and that from another initial pair only
-    one counts: the second if at most half as many pairs contradict it."""
+    """Of the attempts that passed, the first with the most registered photographs; if none passed,
+    the one of the highest rank. The model from another initial pair replaces the standard one if at
+    most half as many pairs contradict it, and does not count otherwise."""
     passed = [attempt for attempt in attempts if attempt.passed]
     again = [attempt for attempt in passed if attempt.configuration is ANOTHER_START]
     if again:
@@ -139,8 +140,9 @@ def try_configurations(
 ) -> list[Attempt]:
     """The attempts, in order, until one passes, no configuration left may help, or time is up.
 
-    If the first passes and leaves photographs out, learned features are tried all the same; if
-    the standard one passes and pairs contradict its poses, another initial pair.
+    Two configurations are tried although an earlier one passed: learned features if the first
+    attempt leaves photographs out, and another initial pair if pairs contradict the poses of the
+    standard one.
 
     Args:
         run: runs one configuration.

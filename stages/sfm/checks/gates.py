@@ -1,8 +1,8 @@
 """Quality gates: what a reconstruction must fulfil, and advice for the photographer if it does not.
 
 A bad reconstruction looks plausible: most photographs may be registered with a small reprojection
-error although the scene is wrong. So several statistics are checked, each of which catches failures
-that the others miss."""
+error although the scene is wrong. So several statistics are checked. Each catches failures that the
+others miss."""
 
 from __future__ import annotations
 
@@ -42,14 +42,16 @@ class ModelStatistics:
         focal_over_prior: estimated focal length over that of EXIF, of the camera where this ratio
             is farthest from 1; None without EXIF.
         pairs_checked: pairs of photographs with at least 30 verified matches.
-        pairs_inconsistent: those of them whose matches do not fit the poses of the model.
-        pairs_turned: those of the inconsistent pairs whose verified matches fit, but of which the
-            others show the scene turned.
-        inconsistent_pair: the names of one such pair.
+        pairs_inconsistent: checked pairs that contradict the poses of the model, in one of two
+            ways: their verified matches do not fit the poses, or they are turned.
+        pairs_turned: pairs whose verified matches fit, while the matches that do not fit agree on
+            another rotation of the scene.
+        inconsistent_pair: the names of one inconsistent pair.
         rotation_to_other_deg: largest disagreement between this model and another of COLMAP's
             models about the relative rotation of photographs that are in both.
-        cut_points: points observed from both sides of the weakest cut of the view graph.
-        cut_views: photographs on the smaller side of that cut; 0: the model is too small to cut.
+        cut_points: points observed in both parts when the model is cut where fewest points hold it
+            together (`statistics.weakest_cut`).
+        cut_views: photographs in the smaller part; 0: the model is too small to cut.
     """
 
     photographs: int
@@ -119,7 +121,7 @@ class Thresholds:
 
 
 THRESHOLDS = Thresholds()
-WARNED_SHARE = 0.02  # of the pairs that contradict a model: deserves a warning
+WARNED_SHARE = 0.02  # of pairs that contradict a model; above, there is a warning
 
 
 def failure(code: str, given: str, wanted: str, hint: str) -> SplatError:
@@ -155,7 +157,7 @@ def check_keypoints(counts: list[int]) -> list[SplatError]:
 
 
 def check_pairs(pairs: list[tuple[int, int, int, int]], photographs: int) -> list[SplatError]:
-    """After matching: is the view graph connected, and did the camera move?
+    """After matching: do the pairs connect the photographs, and did the camera move?
 
     pairs: (first, second, inliers, configuration) as `database.verified_pairs` gives them.
     """
@@ -181,8 +183,8 @@ def check_pairs(pairs: list[tuple[int, int, int, int]], photographs: int) -> lis
 
 
 def connected_groups(pairs: Sequence[Sequence[int]], photographs: int) -> list[list[int]]:
-    """The connected components of the view graph, as sorted positions; largest first. pairs: begin
-    with two positions."""
+    """The groups of photographs that pairs connect, as sorted positions; largest first. pairs: each
+    begins with two positions."""
     links = np.array([pair[:2] for pair in pairs], np.int64).reshape(-1, 2)
     graph = coo_array((np.ones(len(links)), tuple(links.T)), shape=(photographs, photographs))
     _, component = connected_components(graph, directed=False)

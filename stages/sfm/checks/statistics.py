@@ -107,9 +107,11 @@ def sideways_share(model: SparseModel) -> float:
 def weakest_cut(
     points: NDArray[np.integer], views: NDArray[np.integer], photographs: int, fewest: int = 3
 ) -> tuple[int, tuple[int, ...]]:
-    """(points observed in both parts, photographs of the smaller part) of the cut with the fewest
-    points in common, among cuts along the second eigenvector of the
-    normalised Laplacian of the view graph (Fiedler 1973; Shi and Malik 2000).
+    """Cut the photographs in two parts that have the fewest points in common: (points observed in
+    both parts, photographs of the smaller part).
+
+    Photographs are ordered by the second eigenvector of the normalised Laplacian of the graph of
+    shared points (Fiedler 1973; Shi and Malik 2000), and each cut of that order is tried.
 
     Args:
         points, views: [O] observations.

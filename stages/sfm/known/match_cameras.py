@@ -80,8 +80,8 @@ def _matched(views: Sequence[View], photos: Sequence[Photo]) -> tuple[dict[int, 
 
 def _parts(name: str) -> list[str]:
     """The name without its suffix, then its folders, innermost first; case-folded."""
-    plain = unicodedata.normalize("NFC", name.replace("\\", "/")).casefold()
-    path = PurePosixPath(plain)
+    normalised = unicodedata.normalize("NFC", name.replace("\\", "/")).casefold()
+    path = PurePosixPath(normalised)
     stem = path.stem if path.suffix in _SUFFIXES else path.name
     return [stem, *reversed([part for part in path.parent.parts if part not in (".", "..")])]
 

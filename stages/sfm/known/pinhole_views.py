@@ -1,5 +1,5 @@
-"""The pinhole pictures of photographs with known cameras: one of each photograph, or several of a
-wide fisheye's, whose masks end where the photograph does."""
+"""The pinhole pictures of photographs with known cameras: one for each photograph, or several faces
+for a wide fisheye. Masks of faces leave out what the photograph does not show."""
 
 from __future__ import annotations
 
@@ -73,16 +73,16 @@ def write_pinhole_views(
     Interrupted, and SplatError "sfm-photo-unreadable".
     """
     cuts = _cuts(posed, source, report)
-    plain = [i for i, cut in enumerate(cuts) if cut is None]
+    uncut = [i for i, cut in enumerate(cuts) if cut is None]
     views: list[PinholeView] = []
     shown = 0.0
-    if plain:
-        whole = [posed[i] for i in plain]
+    if uncut:
+        whole = [posed[i] for i in uncut]
         pinholes, share = write_undistorted_images(whole, source, folder, report)
-        shown += share * len(plain)
+        shown += share * len(uncut)
         views += [
             PinholeView(posed[i].photo, camera, i, np.eye(3))
-            for i, camera in zip(plain, pinholes, strict=True)
+            for i, camera in zip(uncut, pinholes, strict=True)
         ]
     tables: dict[int, list[_Tables]] = {}  # of the last field: they are large
     for number, cut in enumerate(cuts):
@@ -101,8 +101,8 @@ def write_pinhole_views(
 
 
 def _cuts(posed: Sequence[PosedPhoto], source: Path, report: Report) -> list[_Cut | None]:
-    """[V] None for a photograph of which one pinhole picture is made, without a mask for its lens.
-    Photographs of one camera share one `_Cut`."""
+    """[V] how each photograph is cut; None: into one pinhole picture that needs no mask for its
+    lens. Photographs of one camera share one `_Cut`."""
     photos = [taken.photo for taken in posed]
     groups: dict[tuple[object, ...], list[int]] = defaultdict(list)
     for i, taken in enumerate(posed):
@@ -149,7 +149,7 @@ def _write_faces(
     source: Path,
     folder: Path,
 ) -> Iterator[PinholeView]:
-    """Writes the faces of a photograph, except those of which its mask leaves nothing."""
+    """Writes the faces of a photograph, without those that its mask covers."""
     photo = taken.photo
     image = read_picture(source / photo.image)
     mask = read_picture(source / photo.mask)[..., 0] if photo.mask else None
@@ -192,7 +192,7 @@ def _kept(
     y: NDArray[np.float32],
     inside: NDArray[np.bool_],
 ) -> NDArray[np.uint8]:
-    """[h, w] what counts of a face: what the photograph shows and its mask keeps."""
+    """[h, w] the mask of a face: 0 where the photograph shows nothing or its mask is black."""
     if mask is None:
         return np.where(inside, np.uint8(255), np.uint8(0))
     soft = cv2.INTER_LINEAR if outside == TRANSPARENT else cv2.INTER_NEAREST

@@ -24,7 +24,7 @@ _CELL = 8  # pixels of the picture, each way, to one of the feature map
 _MULTIPLE = 32  # that the network needs of both sides
 _WINDOW = 5  # keypoints are the largest scores among this many pixels each way
 
-# (block, step of each of its convolutions); batch normalisation and ReLU follow each.
+# (block of the network, stride of each of its convolutions); batch normalisation and ReLU follow.
 _ENCODER = (
     ("block1", (1, 2, 1, 2)),
     ("block2", (1, 1)),
@@ -138,8 +138,8 @@ class XFeat:
 def mutual_nearest(
     first: LearnedFeatures, second: LearnedFeatures, best: int, least_cosine: float
 ) -> int:
-    """How many of the `best` features of two photographs are each other's nearest, with at least
-    that cosine between them: a measure of how alike the photographs look."""
+    """How alike two photographs look: how many of their first `best` features are each other's
+    nearest neighbours, with at least `least_cosine` between their descriptors."""
     if not len(first.points) or not len(second.points):
         return 0
     cosines = first.descriptors[:best] @ second.descriptors[:best].T

@@ -98,13 +98,13 @@ class LighterGlue:
 
 
 def _attention(query: Tensor, key: Tensor, value: Tensor) -> Tensor:
-    # The fast kernel wants batches and heads, of which there is one.
+    # The fast kernel wants dimensions for batches and heads.
     query, key, value = query[None, None], key[None, None], value[None, None]
     message: Tensor = functional.scaled_dot_product_attention(query, key, value)[0, 0]
     return message
 
 
 def _rotated(x: Tensor, turn: tuple[Tensor, Tensor]) -> Tensor:
-    """x [N, C], of which each two channels are turned by an angle."""
+    """x [N, C] with each pair of channels turned by an angle."""
     even, odd = x[:, ::2], x[:, 1::2]
     return x * turn[0] + torch.stack((-odd, even), 2).flatten(1) * turn[1]

@@ -79,9 +79,9 @@ def scale_from_gps(
 ) -> MetricScale | None:
     """The scale that takes the cameras to their GPS positions; None if these cannot be used.
 
-    By horizontal positions alone, because heights of phones are less accurate than levelling by
-    cameras; by all three coordinates where positions are accurate, or where a tilt explains nearly
-    all differences of height: cameras that look straight down say little of the level.
+    Horizontal positions decide, because heights of phones are less accurate than levelling by
+    cameras. All three coordinates decide where positions are accurate, and where a tilt explains
+    nearly all differences of height: cameras that look straight down say little about the level.
 
     Args:
         photos: [V] the registered photographs; faces of one picture count once.

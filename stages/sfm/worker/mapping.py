@@ -108,7 +108,7 @@ def _options(job: Mapping) -> pycolmap.IncrementalPipelineOptions:
     options.random_seed = options.mapper.random_seed = project.seed
     options.triangulation.random_seed = project.seed
     options.mapper.num_threads = 1
-    # COLMAP counts images, of which a panorama is twelve: two in common would end a second model.
+    # COLMAP counts images, and a panorama is twelve: two in common would end a second model.
     images = np.bincount(photographs.frames)
     options.min_model_size = SMALLEST_MODEL * int(images.min())
     options.max_model_overlap *= int(images.max())

@@ -82,8 +82,9 @@ def _turn(
     side: float,
     seed: int,
 ) -> NDArray[np.float64] | None:
-    """[3, 3] the rotation of the world between two photographs that those matches show which do not
-    fit the model; None if they show none, or hardly any. Arguments as in `known.epipolar`."""
+    """[3, 3] by how much the scene is turned between two photographs, according to the matches that
+    do not fit the model; None if they show no turn, or a small one. Arguments as in
+    `known.epipolar`."""
     away = epipolar_distances(pair, intrinsics, poses)
     if away is None:
         return None
@@ -109,8 +110,8 @@ def _turn(
 
 
 def _turned_pairs(turns: Sequence[NDArray[np.float64] | None]) -> list[int]:
-    """Positions of the pairs that agree on one turn, or its inverse: as many as there are, and none
-    if these are fewer than `FEWEST_TURNED`."""
+    """Positions of the pairs in the largest group that agrees on one turn or its inverse; none if
+    the group is smaller than `FEWEST_TURNED`."""
     known = [i for i, turn in enumerate(turns) if turn is not None]
     if len(known) < FEWEST_TURNED:
         return []

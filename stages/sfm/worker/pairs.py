@@ -18,9 +18,9 @@ FEWEST_SIMILAR = 4  # matches of the largest features; unrelated pairs have fewe
 LINK_INLIERS = 30
 FEWEST_LINKS = 3
 MOST_LINKING_PAIRS = 20  # for each photograph of the capture
-# Pairs for learned features: for each photograph that is to be joined, those that look most alike;
-# and for each photograph of these pairs those with most inliers, whose common points the others are
-# registered by.
+# Pairs for learned features: each photograph that is to be joined with those that look most like
+# it, and each photograph of these pairs with those that it has most inliers with. Mapping registers
+# a photograph by the points of such neighbours.
 JOINING = 10
 SUPPORTING = 4
 
@@ -63,8 +63,9 @@ def linking_pairs(
     inliers: dict[Pair, int],
     frames: NDArray[np.int64] | None = None,
 ) -> list[Pair]:
-    """More pairs to match so that the view graph is connected: all others of photographs with few
-    links, and all between components; if these are too many, the most similar ones.
+    """More pairs to match so that links connect all photographs: every pair with a photograph that
+    has few links, and every pair between two unconnected groups; if these are too many, the most
+    similar ones.
 
     Args:
         similarity: [P, P] as in `initial_pairs`.
@@ -121,9 +122,9 @@ def joining_pairs(
 
 
 def without_weaker(inliers: dict[Pair, int], uncertain: Iterable[Pair]) -> set[Pair]:
-    """The `uncertain` pairs to drop: those whose photographs are linked by a chain of pairs that
-    each have more inliers. Learned features also match what only looks alike, such as both sides of
-    an object; where they are wrong, a chain around it mostly has more matches.
+    """The `uncertain` pairs to drop: a chain of other pairs, each with more inliers, links the same
+    photographs. Learned features also match what only looks alike, such as both sides of an object.
+    Where they are wrong, a chain of pairs around the object mostly has more matches.
 
     inliers: of all pairs with a two-view geometry.
     """

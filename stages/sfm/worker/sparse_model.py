@@ -35,8 +35,8 @@ class SparseModel:
         observed_points, observing_views, observed_px: [O], [O], [O, 2]; sorted by point, then view.
         pairs: [Q, 2] indices of photographs that share many matches.
         pair_inlier_ratios: [Q] share of those matches that fits the poses of the model.
-        pairs_turned: [Q] whether the other matches of a pair show the scene turned, as those of
-            several other pairs do.
+        pairs_turned: [Q] whether the matches that do not fit show another rotation of the scene, on
+            which several pairs agree.
         rotations_to_others_deg: [M] for each smaller model with photographs in common: the largest
             disagreement about their relative rotations.
     """
@@ -114,8 +114,8 @@ def load_result(folder: Path) -> MappingResult:
 
 
 def without_implausible_views(model: SparseModel) -> SparseModel:
-    """The model without photographs whose poses are unreliable: those that observe fewer than 15
-    points, and those with implausible intrinsics. The latter stay if they are more than a tenth:
+    """The model without photographs whose poses are unreliable: they observe fewer than 15 points,
+    or have implausible intrinsics. If more than a tenth have implausible intrinsics, these stay:
     then the whole model is implausible, and the gates must refuse it."""
     frames = model.view_frames
     seen = np.bincount(frames[model.observing_views], minlength=int(frames.max()) + 1)
