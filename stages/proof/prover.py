@@ -26,7 +26,7 @@ from stages.formats import BY_ENDING, Format, format_of
 from stages.formats.compressed_ply import outlier_shells
 from stages.formats.losses import ENLARGE
 from stages.formats.values import check_finite, drop_undrawable, nonfinite_allowed
-from stages.proof import checks, diagnosis
+from stages.proof import checks
 from stages.proof.compare import differences
 from stages.proof.content import FileContent, NotCrossCheckedError
 from stages.proof.matching import Rows
@@ -42,6 +42,14 @@ _CENTRAL_SHARE = 0.5  # of the splats, to look at where no views are known
 _MAX_DRAWN = 1 << 22
 _MIN_LOSSLESS_DB = 45.0  # a file of a lossless format below this is wrong
 _WARN_LOSSY_DB = 30.0  # a file of a lossy format below this gets a warning
+_WRONG = {
+    "position": "most positions are wrong, by {:.2g} of the scene's extent",
+    "log_scale": "most sizes are wrong, by a factor of e^{:.2g}",
+    "opacity": "most opacities are wrong, by {:.2g}",
+    "rotation": "most rotations are wrong, by {:.2g} degrees",
+    "colour": "most colours are wrong, by {:.2g}",
+    "sh": "most view-dependent colours are wrong, by {:.0%} of their squares",
+}
 
 
 @dataclass(frozen=True)
@@ -180,7 +188,7 @@ class Prover:
             "worst_attribute": found.worst,
             "worst_splat": found.worst_row,
         }
-        fault = diagnosis.explain(self.splats, content, found)
+        fault = " and ".join(_WRONG[name].format(error) for name, error in found.wrong.items())
         if "log_scale" in found.wrong and (loss := _size_loss(BY_ENDING[names[0]], self.splats)):
             fault = f"{fault} (the format {loss})"
         if not lossy and worst < _MIN_LOSSLESS_DB:

@@ -38,6 +38,6 @@ def test_more_rows_than_a_block_come_back(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a.{suffix}"
     formats.write(path, splats)
     found = differences(splats, read_back(path), suffix)
-    assert found.wrong == ()
+    assert found.wrong == {}
     if suffix in ("ply", "html", "usdc"):
         np.testing.assert_array_equal(formats.read(path).sh, splats.sh)
