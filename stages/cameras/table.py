@@ -34,7 +34,6 @@ class CameraFormat:
 
 CAMERA_FILES = (
     CameraFormat("opensfm", "OpenSfM's and ODM's reconstruction.json"),
-    CameraFormat("odm_shots", "ODM's shots.geojson"),
     CameraFormat("arkit", "a folder with ARKit's frame_*.json, or Polycam's keyframes"),
     CameraFormat("nerfstudio", "a transforms.json of nerfstudio's or instant-ngp's", ".json"),
     CameraFormat("blender", "a folder with a synthetic NeRF scene's transforms_train.json"),
@@ -88,9 +87,12 @@ def _reader(path: Path) -> tuple[ModuleType, Path]:
             located = module.locate(path)
         if located is not None:
             return module, located
+    hint = "Check the path; a run's cameras are written by `splat cameras RUN OUT`."
+    if path.suffix.lower() == ".geojson":
+        hint = "For ODM's cameras, name opensfm/reconstruction.json of its project."
     raise UsageError(
         "cameras-unknown",
         given=f"{path} is not a known camera file.",
         wanted=f"{'; or '.join(row.description for row in CAMERA_FILES)}.",
-        hint="Check the path; a run's cameras are written by `splat cameras RUN OUT`.",
+        hint=hint,
     )

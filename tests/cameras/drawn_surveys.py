@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,39 +26,8 @@ from tests.cameras.drawn import (
     radial_projection,
 )
 
-EQUATOR = np.array([500_000.0, 0.0, 100.0])  # longitude 9, latitude 0 in zone 32 of UTM
 SHIFT = [-465_000.5, -5_246_000.25, -408.0]
 UTM32 = 'PROJCRS["WGS 84 / UTM zone 32N",BASEGEOGCRS["WGS 84",ID["EPSG",4326]],ID["EPSG",32632]]'
-
-
-def odm_shots(folder: Path) -> Path:
-    """OpenCV draws; the lens is that of ODM's cameras.json, whose names have no version."""
-    side = max(WIDTH, HEIGHT)
-    matrix = np.array([[FOCAL, 0, 158.0], [0, FOCAL, 122.0], [0, 0, 1]])
-    shots, projects = [], []
-    for name, pose in zip(NAMES, POSES, strict=True):
-        turn, shift = cv2.Rodrigues(pose[:3, :3])[0], pose[:3, 3]
-        projects.append(
-            lambda points, turn=turn, shift=shift: cv2.projectPoints(
-                points, turn, shift, matrix, np.array([K1, K2, P1, P2])
-            )[0][:, 0]
-        )
-        about = {"filename": name, "camera": "v2 drone 320 240 brown 0.8", "focal": FOCAL / side}
-        about |= {"width": WIDTH, "height": HEIGHT, "rotation": turn.ravel().tolist()}
-        about |= {"translation": (EQUATOR - pose[:3, :3].T @ shift).tolist()}
-        place = {"type": "Point", "coordinates": [9.0, 0.0, 100.0]}
-        shots.append({"type": "Feature", "properties": about, "geometry": place})
-    draw(folder / "images", projects)
-    lens = {"k1": K1, "k2": K2, "p1": P1, "p2": P2, "k3": 0.0}
-    lens |= {"focal_x": FOCAL / side, "focal_y": FOCAL / side}
-    lens |= {"c_x": (158 - WIDTH / 2) / side, "c_y": (122 - HEIGHT / 2) / side}
-    camera = {"projection_type": "brown", "width": WIDTH, "height": HEIGHT, **lens}
-    (folder / "cameras.json").write_text(json.dumps({"drone 320 240 brown 0.8": camera}))
-    (folder / "odm_report").mkdir()
-    (folder / "odm_report" / "shots.geojson").write_text(
-        json.dumps({"type": "FeatureCollection", "features": shots})
-    )
-    return folder
 
 
 def _pinhole(pose: NDArray[np.float64]) -> Project:
@@ -203,7 +171,6 @@ def opf(folder: Path) -> Path:
 
 MADE = {
     **drawn.MADE,
-    "odm_shots": odm_shots,
     "arkit": arkit,
     "realityscan_xmp": realityscan_xmp,
     "opf": opf,

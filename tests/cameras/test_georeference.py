@@ -13,7 +13,7 @@ from stages.cameras.camera_file import Georeference
 from stages.cameras.table import read_cameras
 from stages.scene.place import GEOGRAPHIC
 from tests.cameras.drawn import CHUNK, EYES, metashape, opensfm
-from tests.cameras.drawn_surveys import EQUATOR, MADE, SHIFT, UTM32, arkit, odm_shots, opf, polycam
+from tests.cameras.drawn_surveys import MADE, SHIFT, UTM32, arkit, opf, polycam
 
 TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
 LOCAL = CHUNK[CHUNK.index("LOCAL_CS") : CHUNK.index("</reference>")]
@@ -84,7 +84,7 @@ def test_opensfm_with_a_reference_is_in_metres_as_far_as_gps_agrees(tmp_path: Pa
     assert referenced(tmp_path / "d", 48.1, 5 * EYES).metres_per_unit == 0.0
 
 
-SAYING = {"opensfm", "metashape", "odm_shots", "arkit", "opf"}
+SAYING = {"opensfm", "metashape", "arkit", "opf"}
 
 
 @pytest.mark.parametrize("name", sorted(MADE.keys() - SAYING))
@@ -117,17 +117,6 @@ def test_phones_are_in_metres_with_their_up_and_no_place(tmp_path: Path, read: A
     assert (ground.metres_per_unit, ground.place) == (1.0, None)
     assert ground.axes is not None
     np.testing.assert_array_equal(ground.axes[2], [0, 1, 0])
-
-
-def test_odms_shots_are_in_the_zone_of_utm_in_which_they_agree(tmp_path: Path) -> None:
-    ground = read_cameras(odm_shots(tmp_path / "a")).georeference
-    assert ground.place is not None
-    assert ground.place.crs == "EPSG:32632"
-    np.testing.assert_array_equal(ground.place.offset, EQUATOR)
-    path = odm_shots(tmp_path / "b") / "odm_report" / "shots.geojson"
-    path.write_text(path.read_text().replace("[9.0, 0.0, 100.0]", "[9.1, 0.0, 100.0]"))
-    ground = read_cameras(path).georeference
-    assert (ground.metres_per_unit, ground.place) == (1.0, None), "of another projection"
 
 
 @pytest.mark.parametrize(

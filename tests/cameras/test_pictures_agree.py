@@ -122,8 +122,6 @@ def _cut(path: Path) -> None:
         ("bundler", "bundle.out"),
         ("metashape", "cameras.xml"),
         ("realityscan", "cameras.csv"),
-        ("odm_shots", "odm_report/shots.geojson"),
-        ("odm_shots", "cameras.json"),
         ("arkit", "frame_00006.json"),
         ("realityscan_xmp", "p_2.xmp"),
         ("opf", "project.opf"),

@@ -11,7 +11,7 @@ import pytest
 
 from stages.base.errors import SplatError
 from stages.cameras.table import files_of, read_cameras
-from tests.cameras.drawn_surveys import arkit, odm_shots, opf, polycam, realityscan_xmp
+from tests.cameras.drawn_surveys import arkit, opf, polycam, realityscan_xmp
 
 
 def refused(path: Path) -> str:
@@ -105,13 +105,12 @@ def test_metadata_of_other_programs_is_no_camera(tmp_path: Path) -> None:
     assert caught.value.code == "cameras-unknown"
 
 
-def test_odms_older_shots_use_the_only_camera_of_the_project(tmp_path: Path) -> None:
-    folder = odm_shots(tmp_path)
-    path = folder / "odm_report" / "shots.geojson"
-    replaced(path, '"camera": "v2 drone 320 240 brown 0.8", ', "")
-    assert read_cameras(path).distorted == 4
-    (folder / "cameras.json").unlink()
-    assert read_cameras(path).distorted == 0
+def test_odms_shots_are_refused_with_the_file_to_name_instead(tmp_path: Path) -> None:
+    (tmp_path / "shots.geojson").write_text('{"type": "FeatureCollection", "features": []}')
+    with pytest.raises(SplatError) as caught:
+        read_cameras(tmp_path / "shots.geojson")
+    assert caught.value.code == "cameras-unknown"
+    assert "opensfm/reconstruction.json" in caught.value.hint
 
 
 @pytest.mark.parametrize(
