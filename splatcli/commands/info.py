@@ -6,6 +6,7 @@ import tempfile
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 
 from splatcli import console
@@ -16,20 +17,15 @@ from stages.evaluate.evaluation import seconds_per_frame
 from stages.formats import format_of
 from stages.proof.checks import byte_breakdown_of
 from stages.proof.statistics import (
-    DEGREES,
-    GIANT_PART,
     NEEDLE_ASPECT,
     OUTLIER_BOXES,
     Statistics,
-    floats_of,
-    mass_within,
-    memory_of,
     statistics_of,
 )
 from stages.raster.backends import backend_of
 from stages.run import results
 from stages.run.pipeline import Pipeline
-from stages.scene import ExportedFile, Splats
+from stages.scene import ExportedFile, Splats, parameters_per_splat
 from stages.scene.framing import orbit_cameras
 
 _ATTRIBUTES = {
@@ -40,6 +36,7 @@ _ATTRIBUTES = {
     "sh": "colours",
 }
 
+_FLOAT32_BYTES = 4
 _TIMED_FRAMES = 8
 
 
@@ -90,20 +87,9 @@ def describe(splats: Splats, statistics: Statistics) -> dict[str, Any]:
     facts["origin"] = [float(value) for value in splats.origin]
     if splats.place is not None:
         facts["place"] = splats.place.to_json()
-    return facts | _memory(splats)
-
-
-def _memory(splats: Splats) -> dict[str, Any]:
-    """Floats and bytes in memory for each splat and for all, and the mass of a Gaussian within 1, 2
-    and 3 standard deviations."""
-    one, every = (memory_of(splats.sh_degree, count) for count in (1, len(splats)))
-    return {
-        "floats_per_splat": floats_of(splats.sh_degree),
-        "floats_per_splat_by_degree": {str(degree): floats_of(degree) for degree in DEGREES},
-        "memory_bytes_per_splat": one,
-        "memory_bytes": every,
-        "mass_share_within_sigmas": {str(n): round(mass_within(n), 4) for n in (1, 2, 3)},
-    }
+    facts["floats_per_splat"] = int(parameters_per_splat(np.array(splats.sh_degree)))
+    facts["memory_bytes"] = _FLOAT32_BYTES * facts["floats_per_splat"] * statistics.count
+    return facts
 
 
 def _speed(splats: Splats, pipeline: Pipeline | None) -> dict[str, Any]:
@@ -137,7 +123,6 @@ def warnings_of(statistics: Statistics) -> list[tuple[str, str]]:
         "too-large": "larger than numbers go: no viewer can draw them.",
         "transparent": "below an opacity of 1/255, and so never seen.",
         "needles": f"needles, over {NEEDLE_ASPECT:g} times as long as wide.",
-        "giants": f"giants, larger than {GIANT_PART:g} of the scene.",
         "outliers": f"outliers, over {OUTLIER_BOXES:g} times as far out as the middle 98 %.",
         "duplicates": "duplicates of others.",
     }
