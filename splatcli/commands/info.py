@@ -15,7 +15,6 @@ from splatcli.folders import load_target
 from stages.base import scratch
 from stages.evaluate.evaluation import seconds_per_frame
 from stages.formats import format_of
-from stages.proof.checks import byte_breakdown_of
 from stages.proof.statistics import (
     NEEDLE_ASPECT,
     OUTLIER_BOXES,
@@ -140,13 +139,7 @@ def _share(count: int, statistics: Statistics) -> str:
 def _about_file(path: Path, count: int) -> dict[str, Any]:
     size = format_of(path).size_bytes(path)
     facts: dict[str, Any] = {"file": str(path), "size_bytes": size}
-    breakdown = byte_breakdown_of(path)
-    if breakdown.unknown:
-        facts["bytes_per_splat_unknown"] = breakdown.unknown
-    elif count:
-        name = "bytes_per_splat_unpacked" if breakdown.unpacked else "bytes_per_splat"
-        facts[name] = {what: round(n / count, 2) for what, n in breakdown.parts.items()}
-    return facts
+    return facts | ({"bytes_per_splat": round(size / count, 2)} if count else {})
 
 
 def _about_run(pipeline: Pipeline) -> dict[str, Any]:

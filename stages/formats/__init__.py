@@ -11,8 +11,8 @@ To add a format, in six steps:
    turns both into SplatError, and checks the values.
 3. Add a row to `table.TABLE`. `splat export`, `convert`, `verify`, `info` and their help, the
    fuzzer and the tests of all formats are driven by this table.
-4. Write an independent reader (of a library, or of raw bytes) and a byte breakdown in
-   `stages.proof`, and add their row to `stages.proof.checks.CHECKS`.
+4. Write an independent reader (of a library, or of raw bytes) in `stages.proof`, and add its row
+   to `stages.proof.checks.CHECKS`.
 5. Run `python -m tests.docs_tables`, which writes the tables of the documentation.
 6. Run `pytest tests/formats tests/proof tests/fuzz`.
 """

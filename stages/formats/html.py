@@ -98,12 +98,12 @@ def read(path: Path) -> Splats:
     with tempfile.TemporaryDirectory(prefix="splat-") as folder:
         inside = Path(folder) / "inside.ply"
         with inside.open("wb") as file:
-            for block in unzipped(path):
+            for block in _unzipped(path):
                 file.write(block)
         return ply.read(inside)
 
 
-def unzipped(path: Path) -> Iterator[bytes]:
+def _unzipped(path: Path) -> Iterator[bytes]:
     """The .ply inside, in blocks; each script element is one line."""
     start, end = (re.escape(t.encode("ascii")) for t in (document.CHUNK_START, document.CHUNK_END))
     wanted = re.compile(start + rb"([A-Za-z0-9+/=]*)" + end)

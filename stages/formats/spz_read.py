@@ -129,15 +129,6 @@ def _table(file: BinaryIO, size: int) -> tuple[Header, bytes, list[tuple[int, in
     return values, extensions, list(_TABLE_ROW.iter_unpack(table))
 
 
-def packed_sizes(path: Path) -> list[int]:
-    """Compressed bytes of each array of version 4; [] for versions with one gzip stream."""
-    with path.open("rb") as file:
-        if file.read(len(MAGIC)) != MAGIC:
-            return []
-        file.seek(0)
-        return [packed for packed, _ in _table(file, path.stat().st_size)[2]]
-
-
 def _is_y_up(records: bytes) -> bool:
     """Whether the axes are right, up, back; False if they are ours. Other extensions (limits for
     cameras) are ignored. Raises BadFileError for other axes."""

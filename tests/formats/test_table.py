@@ -14,7 +14,7 @@ from stages import formats
 from stages.base.errors import Family, SplatError
 from stages.formats import BY_ENDING, FORMATS, Format
 from stages.formats.mesh_table import MESHES, MeshFormat
-from stages.proof.checks import CHECKS, byte_breakdown_of
+from stages.proof.checks import CHECKS
 from tests.formats.files import read
 from tests.formats.truth import many_splats
 
@@ -69,19 +69,6 @@ def test_a_format_leaves_the_files_that_its_row_names(tmp_path: Path, row: Forma
     formats.write(path, replace(many_splats(9), origin=np.zeros(3)))
     assert sorted(row.files(path)) == sorted(tmp_path.iterdir())
     assert row.size_bytes(path) == sum(file.stat().st_size for file in tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("row", FORMATS.values(), ids=lambda row: row.ending)
-def test_every_format_has_a_byte_breakdown_or_a_reason(tmp_path: Path, row: Format) -> None:
-    path = tmp_path / f"a.{row.ending}"
-    formats.write(path, many_splats(300))
-    found = byte_breakdown_of(path)
-    if found.unknown:
-        assert not found.parts
-    else:
-        assert {"positions", "rotations", "scales"} <= found.parts.keys()
-        assert found.parts["positions"] >= 300 * 4
-        assert found.unpacked or sum(found.parts.values()) <= row.size_bytes(path)
 
 
 @pytest.mark.parametrize("ending", MESHES)
