@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base import scratch
-from stages.base.blocks import blocks, reported_blocks
+from stages.base.blocks import blocks
 from stages.scene import Splats, dc_to_rgb
 from stages.scene.quantiles import quantiles
 
@@ -57,7 +57,7 @@ def matched_rows(truth: Splats, file: Splats, orders: Iterable[Rows]) -> Rows:
     found, fewest = (every, every, np.zeros(n, bool)), n + 1
     for index in (np.arange(n), *orders) if n else ():
         distance, unlike = np.empty(n, np.float32), np.empty(n, bool)
-        for rows in reported_blocks(n):
+        for rows in blocks(n):
             moved = np.abs(truth.means[index[rows]] - file.means[rows])
             distance[rows] = moved.max(axis=1, initial=0.0)
             unlike[rows] = _unlike(values[0][index[rows]], values[1][rows])
