@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import typer
 
 from splatcli import console
 from splatcli.arguments import RunOrFile
 from splatcli.folders import load_target
 from stages.base import scratch
-from stages.evaluate.evaluation import seconds_per_frame
 from stages.formats import format_of
 from stages.proof.statistics import (
     NEEDLE_ASPECT,
@@ -21,11 +19,9 @@ from stages.proof.statistics import (
     Statistics,
     statistics_of,
 )
-from stages.raster.backends import backend_of
 from stages.run import results
 from stages.run.pipeline import Pipeline
 from stages.scene import ExportedFile, Splats, parameters_per_splat
-from stages.scene.framing import orbit_cameras
 
 _ATTRIBUTES = {
     "means": "positions",
@@ -36,15 +32,9 @@ _ATTRIBUTES = {
 }
 
 _FLOAT32_BYTES = 4
-_TIMED_FRAMES = 8
 
 
-def info(
-    target: RunOrFile = None,
-    speed: Annotated[
-        bool, typer.Option("--speed", help="Draw some pictures too: frames a second, here.")
-    ] = False,
-) -> None:
+def info(target: RunOrFile = None) -> None:
     """Print statistics of a file or a run: splats, SH degrees, bounds, bytes, and warnings."""
     with scratch.scratch_in(Path(tempfile.gettempdir()), spare=True):
         splats, pipeline = load_target(target, strict=False)
@@ -54,8 +44,6 @@ def info(
         facts = {**_about_file(target, len(splats)), **facts}
     if pipeline is not None:
         facts = {**_about_run(pipeline), **facts}
-    if speed and statistics.count:
-        facts |= _speed(splats, pipeline or results.run_around(target))
     warnings = warnings_of(statistics)
     if console.mode.as_json:
         console.emit("info", **facts, warnings=dict(warnings))
@@ -89,26 +77,6 @@ def describe(splats: Splats, statistics: Statistics) -> dict[str, Any]:
     facts["floats_per_splat"] = int(parameters_per_splat(np.array(splats.sh_degree)))
     facts["memory_bytes"] = _FLOAT32_BYTES * facts["floats_per_splat"] * statistics.count
     return facts
-
-
-def _speed(splats: Splats, pipeline: Pipeline | None) -> dict[str, Any]:
-    """Frames a second from some of the photographs' cameras, at the size of the training; from
-    cameras around the splats if there are no photographs."""
-    console.note_compiling()
-    views = results.views_of(pipeline)
-    chosen = views[:: max(1, len(views) // _TIMED_FRAMES)][:_TIMED_FRAMES]
-    cameras = [splats.draw_settings.camera(v.camera) for v in chosen] or orbit_cameras(
-        splats, _TIMED_FRAMES, 0.9
-    )
-    backend = results.backend_of_run(pipeline)
-    seconds = seconds_per_frame(splats, cameras, backend)
-    return {
-        "frames_a_second": round(1 / float(seconds.mean()), 2),
-        "frame_width": cameras[0].width,
-        "frame_height": cameras[0].height,
-        "frames_timed": len(cameras),
-        "backend": backend_of(backend).name,
-    }
 
 
 def warnings_of(statistics: Statistics) -> list[tuple[str, str]]:

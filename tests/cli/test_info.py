@@ -69,18 +69,3 @@ def test_memory_is_reported_at_the_degree_of_the_file(
     facts = info(tmp_path / f"a.{suffix}")
     assert facts["floats_per_splat"] == floats
     assert facts["memory_bytes"] == 4 * floats * 1000
-
-
-def test_speed_is_measured_on_request_with_its_conditions(tmp_path: Path) -> None:
-    path = tmp_path / "a.ply"
-    formats.write(path, many_splats(300))
-    assert "frames_a_second" not in info(path)
-    result = CliRunner().invoke(app, ["info", str(path), "--speed", "--json"])
-    facts = json.loads(result.stdout)
-    assert facts["frames_a_second"] > 0
-    assert (facts["frame_width"], facts["frame_height"], facts["frames_timed"]) == (
-        960,
-        720,
-        8,
-    )
-    assert facts["splats"] == 300
