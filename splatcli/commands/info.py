@@ -91,7 +91,6 @@ def warnings_of(statistics: Statistics) -> list[tuple[str, str]]:
         "transparent": "below an opacity of 1/255, and so never seen.",
         "needles": f"needles, over {NEEDLE_ASPECT:g} times as long as wide.",
         "outliers": f"outliers, over {OUTLIER_BOXES:g} times as far out as the middle 98 %.",
-        "duplicates": "duplicates of others.",
     }
     for code, what in kinds.items():
         if count := statistics.troubles.get(code, 0):

@@ -9,7 +9,6 @@ Troublesome splats:
 - transparent: the opacity is below 1/255, so that it is never drawn.
 - no rotation: the quaternion is 0 or too short to be normalised; too large: the squared scale
   exceeds float32. Neither can be drawn.
-- duplicate: equal to another splat in everything but SH above degree 0.
 """
 
 from __future__ import annotations
@@ -69,19 +68,14 @@ def statistics_of(splats: Splats) -> Statistics:
     whole, not_finite = _finite(splats)
     box = dict(zip(_BOX, quantiles(splats.means[whole], tuple(_BOX.values())), strict=True))
     troubles: Counter[str] = Counter()
-    keys = np.empty(len(splats), np.uint64)
     for rows in blocks(len(splats)):
-        block = splats.take(rows)
-        keys[rows] = _fingerprints(block)
-        for name, marks in _troubles(block.take(whole[rows]), box).items():
+        for name, marks in _troubles(splats.take(rows).take(whole[rows]), box).items():
             troubles[name] += int(np.count_nonzero(marks))
-    keys = keys[whole]
-    troubles["duplicates"] = len(keys) - len(np.unique(keys))
     return Statistics(
         count=len(splats),
         by_degree=by_degree,
         not_finite=not_finite,
-        whole=len(keys),
+        whole=int(np.count_nonzero(whole)),
         **box,
         median_scale=float(np.exp(_median(splats.log_scales[whole]))),
         median_opacity=1 / (1 + float(np.exp(-_median(splats.opacity_logits[whole])))),
@@ -115,20 +109,6 @@ def _troubles(splats: Splats, box: dict[str, NDArray[np.float64]]) -> dict[str, 
             "no-rotation": np.abs(splats.quaternions).max(axis=1, initial=0.0) < QUATERNION_MIN,
             "too-large": logs[:, 2] > LOG_SCALE_MAX,
         }
-
-
-def _fingerprints(splats: Splats) -> NDArray[np.uint64]:
-    """[N] a 64-bit hash of each row; two different rows of 10 million collide with a probability of
-    3 in a million."""
-    columns = (splats.means, splats.quaternions, splats.log_scales, splats.sh[:, 0])
-    table = np.concatenate([*columns, splats.opacity_logits[:, None]], axis=1, dtype=np.float32)
-    words = np.ascontiguousarray(table).view(np.uint32).astype(np.uint64)
-    key = np.zeros(len(words), np.uint64)
-    for column in words.T:  # the prime of FNV-1a, and a shift that mixes in the high bits
-        key = (key ^ column) * np.uint64(0x100000001B3)
-        key ^= key >> np.uint64(29)
-        key *= np.uint64(0xBF58476D1CE4E5B9)
-    return key
 
 
 def _median(values: NDArray[np.floating]) -> np.float64:
