@@ -23,7 +23,7 @@ class OperationSyntax:
     help: str
 
 
-_REGION = "box:...|sphere:...|hull:FILE|lasso:..."
+_REGION = "box:...|sphere:...|lasso:..."
 OPERATIONS = {
     operation.name: operation
     for operation in (

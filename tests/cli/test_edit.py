@@ -160,7 +160,7 @@ def test_where_cameras_are_known_what_is_written_is_proven(
     [
         (["--keep", "x >"], "edit-keep", 2),
         (["--crop", "cube:1"], "edit-region", 2),
-        (["--crop", "hull:none.json"], "edit-hull-unreadable", 3),
+        (["--crop", "hull:none.json"], "edit-region", 2),
         (["--rotate", "y"], "edit-rotate", 2),
         (["--rotate", "0,0,0:20"], "edit-rotate", 2),
         (["--scale", "0"], "edit-scale", 2),
