@@ -12,7 +12,7 @@ import itertools
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from stages.base.settings import settings_of
 from stages.run.stages import STAGE_NAMES, STAGE_OF
@@ -97,23 +97,21 @@ def formats() -> str:
 
 
 def format_modules() -> str:
-    from stages.formats.mesh_table import MESHES
-    from stages.formats.table import TABLE
+    from stages.formats.codecs import CODECS
+    from stages.formats.mesh_files import CODECS_OF_MESHES
     from stages.proof.checks import CHECKS
 
     rows: list[tuple[str, ...]] = []
-    for row in TABLE:
-        check = CHECKS[row.ending].read
-        places = (row.writer, row.reader, f"{check.__module__}:{check.__qualname__}")
-        rows.append((f"`{row.ending}`", *(_place(place) for place in places)))
-    for mesh in MESHES.values():
-        rows.append((f"`{mesh.ending}`", _place(mesh.writer), "", _place(mesh.independent_reader)))
+    for ending, codec in CODECS.items():
+        functions = (codec.write, codec.read, CHECKS[ending].read)
+        rows.append((f"`{ending}`", *map(_place, functions)))
+    for ending, mesh in CODECS_OF_MESHES.items():
+        rows.append((f"`{ending}`", _place(mesh.write), "", _place(mesh.read)))
     return _table(("format", "writer", "reader", "independent reader"), rows)
 
 
-def _place(text: str) -> str:
-    module, _, name = text.partition(":")
-    return f"`{module.replace('.', '/')}.py` `{name}`"
+def _place(function: Any) -> str:
+    return f"`{function.__module__.replace('.', '/')}.py` `{function.__qualname__}`"
 
 
 def cameras() -> str:

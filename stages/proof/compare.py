@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pkgutil import resolve_name
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.formats import BY_ENDING, Format
+from stages.formats import BY_ENDING
+from stages.formats.codecs import CODECS
 from stages.proof.content import FileContent, arrays_by_rows
 from stages.proof.matching import Rows, extent_of, matched_rows
 from stages.scene import SH_C0, Splats
@@ -75,14 +75,13 @@ def differences(splats: Splats, content: FileContent, *names: str) -> Difference
 
     names: the formats that either went through; some sort the rows or reduce the SH degree.
     """
-    formats = [BY_ENDING[name] for name in names]
     file = content.splats
     upright = content.world_from_file[1, 1] < 0
     placed = splats
     if upright:
         placed = replace(splats, means=splats.means * FLIP.astype(splats.means.dtype))
-    rows = matched_rows(placed, file, _orders(placed, file, formats))
-    kept = [row.sh_degree for row in formats]
+    rows = matched_rows(placed, file, _orders(placed, file, names))
+    kept = [BY_ENDING[name].sh_degree for name in names]
     degree = min([max(splats.sh_degree, file.sh_degree), *kept])
     sums = np.zeros(3)
 
@@ -97,12 +96,11 @@ def differences(splats: Splats, content: FileContent, *names: str) -> Difference
     return _summary(arrays_by_rows(len(file), errors_of, _BLOCK), sums, extent_of(splats), rows)
 
 
-def _orders(truth: Splats, file: Splats, formats: list[Format]) -> Iterator[Rows]:
+def _orders(truth: Splats, file: Splats, names: tuple[str, ...]) -> Iterator[Rows]:
     """The orders in which the formats may have written either side; an iterator, because the first
     often fits."""
-    for row in formats:
-        if row.order:
-            order = resolve_name(row.order)
+    for name in names:
+        if order := CODECS[name].order:
             yield order(truth)
             yield np.argsort(order(file))
 

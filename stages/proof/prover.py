@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from pkgutil import resolve_name
 from typing import Any
 
 import numpy as np
@@ -23,6 +22,7 @@ from stages.base.errors import QualityError
 from stages.base.text import counted, reason_of
 from stages.evaluate.image_metrics import IDENTICAL_DB, capped_psnr_db
 from stages.formats import BY_ENDING, Format, format_of
+from stages.formats.codecs import CODECS
 from stages.formats.compressed_ply import outlier_shells
 from stages.formats.losses import ENLARGE
 from stages.formats.values import check_finite, drop_undrawable, nonfinite_allowed
@@ -131,7 +131,7 @@ class Prover:
                 given=f"{path} came out wrong: {proof.fault}.",
                 wanted="A file that another program reads as the same splats.",
                 hint=f"{ENLARGE}."
-                if _size_loss(format_of(path), self.splats)
+                if CODECS[format_of(path).ending].size_loss(self.splats)
                 else "Write another format, and report this with the file that was read.",
             )
         return proof
@@ -189,7 +189,7 @@ class Prover:
             "worst_splat": found.worst_row,
         }
         fault = " and ".join(_WRONG[name].format(error) for name, error in found.wrong.items())
-        if "log_scale" in found.wrong and (loss := _size_loss(BY_ENDING[names[0]], self.splats)):
+        if "log_scale" in found.wrong and (loss := CODECS[names[0]].size_loss(self.splats)):
             fault = f"{fault} (the format {loss})"
         if not lossy and worst < _MIN_LOSSLESS_DB:
             drawn = f"drawn again it differs by {worst:.1f} dB"
@@ -248,10 +248,6 @@ def _drawable(content: FileContent) -> FileContent:
         return replace(content, splats=drop_undrawable(check_finite(content.splats))[0])
 
 
-def _size_loss(row: Format, splats: Splats) -> str:
-    return resolve_name(row.size_loss)(splats) if row.size_loss else ""
-
-
 _DROP = "`splat edit --drop-floaters` removes outliers"
 
 
@@ -274,7 +270,7 @@ def losses_shown(row: Format, proof: Proof, splats: Splats) -> str:
 
 def _cause(row: Format, splats: Splats, moved: bool) -> str:
     """moved: whether positions differ by more than the distance between neighbours."""
-    if moved and row.position_loss and (loss := resolve_name(row.position_loss)(splats)):
+    if moved and (loss := CODECS[row.ending].position_loss(splats)):
         return f"it {loss}. {_DROP}."
     if moved and (count := int(np.count_nonzero(outlier_shells(splats.means)))):
         return f"{counted(count, 'outlier')} widened the range of its positions. {_DROP}."
