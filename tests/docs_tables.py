@@ -8,25 +8,63 @@ from __future__ import annotations
 
 import ast
 import importlib
-import itertools
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from stages.base.settings import settings_of
 from stages.run.stages import STAGE_NAMES, STAGE_OF
 from tests.layers import LAYERS
-
-if TYPE_CHECKING:
-    from stages.formats.mesh_table import MeshFormat
-    from stages.formats.table import Format
 
 ROOT = Path(__file__).parent.parent
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
 _BLOCK = re.compile(r"(<!-- begin: ([\w-]+) -->\n).*?(<!-- end -->)", re.S)
 
 Rows = Sequence[tuple[str, ...]]
+# What README says of formats: (endings, what they open in, what they keep).
+FORMAT_CELLS = (
+    (("ply",), "nearly every program that reads splats", "everything, float32"),
+    (("splat",), "web viewers", "8-bit colour and rotation; one colour, averaged over the views"),
+    (("glb", "gltf"), "viewers with KHR_gaussian_splatting; others show points", "everything"),
+    (
+        ("usda", "usdc", "usdz"),
+        "USD tools with particle fields (OpenUSD 26.03 or newer)",
+        "everything",
+    ),
+    (
+        ("quantised.glb",),
+        "as `glb`; three.js blends splats of each degree of view dependence by themselves",
+        "sizes, rotations and opacities in 16 bits",
+    ),
+    (
+        ("compressed.ply",),
+        "PlayCanvas, SuperSplat, Spark",
+        "positions and sizes to 1/1000 of those of 256 neighbours, 8-bit colour",
+    ),
+    (
+        ("spz",),
+        "Spark, Open3D, three.js",
+        "sizes to 3 %, 8-bit colour, 4 to 5 bits of view-dependent colour",
+    ),
+    (
+        ("sog",),
+        "PlayCanvas, SuperSplat, Spark",
+        "16-bit positions, 256 sizes and colours, a palette of view-dependent colours",
+    ),
+    (
+        ("lod-meta.json",),
+        "PlayCanvas, SuperSplat, which load nearby chunks first",
+        "as `sog`, in chunks and levels of detail; written by `splat edit`",
+    ),
+    (
+        ("html",),
+        "any browser, from disk, without a network",
+        "everything; also the viewer and the cameras",
+    ),
+    (("mesh.glb",), "game engines, mesh tools", "no splats: triangles for collision"),
+    (("mesh.ply",), "game engines, mesh tools", "no splats: triangles for collision"),
+)
 
 
 def _table(head: tuple[str, ...], rows: Rows) -> str:
@@ -80,19 +118,17 @@ def stages() -> str:
     return _table(("folder", "module", "reads", "version", "options"), rows)
 
 
-def _formats() -> list[Format | MeshFormat]:
-    from stages.formats.mesh_table import MESHES
-    from stages.formats.table import TABLE
-
-    return [*TABLE, *MESHES.values()]
-
-
 def formats() -> str:
+    from stages.formats.mesh_table import MESHES
+    from stages.formats.table import BY_ENDING
+
+    assert [e for endings, _, _ in FORMAT_CELLS for e in endings] == [*BY_ENDING, *MESHES]
+    y_up = {row.ending for row in BY_ENDING.values() if row.y_up}
+    y_up |= {row.ending for row in MESHES.values() if row.y_up}
     rows: list[tuple[str, ...]] = []
-    same = itertools.groupby(_formats(), lambda row: (row.opens_in, row.keeps, row.y_up))
-    for (opens_in, keeps, y_up), group in same:
-        names = ", ".join(f"`{row.ending}`" for row in group)
-        rows.append((names, opens_in, f"{keeps}{'; y up' if y_up else ''}"))
+    for endings, opens_in, keeps in FORMAT_CELLS:
+        names = ", ".join(f"`{ending}`" for ending in endings)
+        rows.append((names, opens_in, f"{keeps}{'; y up' if endings[0] in y_up else ''}"))
     return _table(("`--format`", "opens in", "keeps"), rows)
 
 

@@ -17,13 +17,10 @@ class MeshFormat:
     Attributes:
         ending: what a file's name ends in, without the dot; also the value of `--format`.
         y_up: whether the file's axes are y up, turned 180 degrees about x from ours.
-        opens_in, keeps: two cells of README's table.
     """
 
     ending: str
     y_up: bool = False
-    opens_in: str = "game engines, mesh tools"
-    keeps: str = "no splats: triangles for collision"
 
 
 MESHES = {row.ending: row for row in (MeshFormat("mesh.glb", y_up=True), MeshFormat("mesh.ply"))}

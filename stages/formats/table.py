@@ -7,7 +7,7 @@ are in `stages.formats.codecs`, its checks in `stages.proof.checks`, by the same
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from stages.base.errors import UsageError
@@ -21,7 +21,6 @@ class Format:
 
     Attributes:
         ending: what a file's name ends in, without the dot; also the value of `--format`.
-        opens_in, keeps: two cells of README's table.
         loses: what of the splats changes, as the end of "the format ..."; "" if every value comes
             back as float32.
         sh_degree: the highest SH degree that is kept.
@@ -41,8 +40,6 @@ class Format:
     """
 
     ending: str
-    opens_in: str
-    keeps: str
     loses: str = ""
     sh_degree: int = 3
     y_up: bool = False
@@ -87,57 +84,29 @@ class Format:
 
 _MESH = re.compile(r"\.mesh\.(glb|ply)$")  # of the names of meshes
 
-_GLB = Format(
-    "glb",
-    opens_in="viewers with KHR_gaussian_splatting; others show points",
-    keeps="everything",
-    y_up=True,
-)
-_USD = Format(
-    "usda",
-    opens_in="USD tools with particle fields (OpenUSD 26.03 or newer)",
-    keeps="everything",
-    y_up=True,
-)
 TABLE = (
-    Format(
-        "ply",
-        opens_in="nearly every program that reads splats",
-        keeps="everything, float32",
-    ),
+    Format("ply"),
     Format(
         "splat",
-        opens_in="web viewers",
-        keeps="8-bit colour and rotation; one colour, averaged over the views",
         loses="has 8-bit colours that do not change with the view",
         sh_degree=0,
         needs_finetuning=True,
         says_drawing=False,
         holds_origin=False,
     ),
-    _GLB,
-    replace(_GLB, ending="gltf", sidecar=".bin"),
-    _USD,
-    replace(_USD, ending="usdc"),
-    replace(_USD, ending="usdz"),
-    replace(
-        _GLB,
-        ending="quantised.glb",
-        opens_in="as `glb`; three.js blends splats of each degree of view dependence by themselves",
-        keeps="sizes, rotations and opacities in 16 bits",
-        loses="has rotations, sizes and opacities of 16 bits",
-    ),
+    Format("glb", y_up=True),
+    Format("gltf", y_up=True, sidecar=".bin"),
+    Format("usda", y_up=True),
+    Format("usdc", y_up=True),
+    Format("usdz", y_up=True),
+    Format("quantised.glb", loses="has rotations, sizes and opacities of 16 bits", y_up=True),
     Format(
         "compressed.ply",
-        opens_in="PlayCanvas, SuperSplat, Spark",
-        keeps="positions and sizes to 1/1000 of those of 256 neighbours, 8-bit colour",
         loses="has positions and sizes of 10 and 11 bits, and 8-bit colours",
         needs_finetuning=True,
     ),
     Format(
         "spz",
-        opens_in="Spark, Open3D, three.js",
-        keeps="sizes to 3 %, 8-bit colour, 4 to 5 bits of view-dependent colour",
         holds_origin=False,
         loses="has sizes in steps of 6 %, 8-bit colours and view-dependent colour of 4 and 5 bits",
         needs_finetuning=True,
@@ -146,28 +115,18 @@ TABLE = (
     ),
     Format(
         "sog",
-        opens_in="PlayCanvas, SuperSplat, Spark",
-        keeps="16-bit positions, 256 sizes and colours, a palette of view-dependent colours",
         has_bit_depths=True,
         loses="has 256 sizes and colours, and a palette of view-dependent colours",
         needs_finetuning=True,
     ),
     Format(
         "lod-meta.json",
-        opens_in="PlayCanvas, SuperSplat, which load nearby chunks first",
-        keeps="as `sog`, in chunks and levels of detail; written by `splat edit`",
         loses="has 256 sizes and colours, and a palette of view-dependent colours",
         sidecar=".html",
         takes_views=True,
         streamed=True,
     ),
-    Format(
-        "html",
-        opens_in="any browser, from disk, without a network",
-        keeps="everything; also the viewer and the cameras",
-        takes_views=True,
-        drawn_antialiased=True,
-    ),
+    Format("html", takes_views=True, drawn_antialiased=True),
 )
 BY_ENDING = {row.ending: row for row in TABLE}
 FORMATS = {row.ending: row for row in TABLE if not row.streamed}  # one file each
