@@ -7,7 +7,6 @@ page; tests/test_docs.py fails when a page is stale.
 from __future__ import annotations
 
 import ast
-import importlib
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -155,9 +154,9 @@ def cameras() -> str:
 
     rows: list[tuple[str, ...]] = []
     for row in CAMERA_FILES:
-        module = importlib.import_module(f"stages.cameras.{row.module}")
-        points = "yes" if hasattr(module, "read_points") else "no"
-        rows.append((row.description, points, f"`stages/cameras/{row.module}.py`"))
+        points = "yes" if row.read_points else "no"
+        module = row.read.__module__.replace(".", "/")
+        rows.append((row.description, points, f"`{module}.py`"))
     return _table(("file", "sparse points", "read by"), rows)
 
 
