@@ -16,8 +16,8 @@ from stages.base.distribution import NAME, VERSION
 from stages.base.libraries import versions
 from stages.base.memory import available_mib
 from stages.base.stage import Numbers, Stage
+from stages.run.listener import Listener
 from stages.run.manifest import Manifest
-from stages.run.pipeline import Listener
 
 _LOGGERS = tuple(map(logging.getLogger, ("splatcli", "stages", "py.warnings")))
 _log = logging.getLogger(__name__)

@@ -16,7 +16,8 @@ from stages.base.atomic import make_folder
 from stages.base.errors import UsageError
 from stages.formats import format_of
 from stages.formats.losses import losses_of
-from stages.proof.prover import Prover, cameras_for, losses_shown
+from stages.proof.losses import losses_shown
+from stages.proof.prover import Prover, cameras_for
 from stages.run import results
 from stages.scene import Splats
 

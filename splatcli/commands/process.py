@@ -13,8 +13,8 @@ from stages.base.errors import UsageError
 from stages.base.settings import changed
 from stages.cameras.table import read_cameras
 from stages.run import runfolder
-from stages.run.attempt import Listeners
-from stages.run.pipeline import Listener, Pipeline
+from stages.run.listener import Listener, Listeners
+from stages.run.pipeline import Pipeline
 from stages.run.runfile import RunFile
 from stages.run.stages import STAGE_NAMES
 from stages.sfm.known.match_cameras import check_split

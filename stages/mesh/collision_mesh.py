@@ -1,7 +1,4 @@
-"""Splats and their cameras -> the collision mesh and its quality figures.
-
-Also: vertex colours of the mesh from the drawn views.
-"""
+"""Splats and their cameras -> the collision mesh and its quality figures."""
 
 from __future__ import annotations
 
@@ -9,13 +6,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from stages.base.errors import Interrupted
 from stages.base.stage import Report
 from stages.mesh import depth_maps, extract, fuse
 from stages.mesh.depth_maps import DepthMap
 from stages.mesh.distance import distances_to_mesh
+from stages.mesh.vertex_colours import colour_vertices
 from stages.raster.draw import raster_settings_of
 from stages.scene import Reconstruction, Splats, split_held_out
 from stages.scene.mesh import Mesh
@@ -113,33 +110,3 @@ def _covered(mesh: Mesh, maps: list[DepthMap], voxel: float) -> float:
     places = np.concatenate([found.points(step) for found in solid])
     near = distances_to_mesh(places, mesh, voxel) <= _COVERED_VOXELS * voxel
     return round(float(near.mean()), 4)
-
-
-def colour_vertices(mesh: Mesh, maps: list[DepthMap], tolerance: float) -> Mesh:
-    """The mesh with colours: the weighted mean of the pixels that see each vertex.
-
-    tolerance: the largest distance in depth between a pixel and a vertex that it sees, world units.
-    A vertex that no pixel sees takes the colour of the nearest one that is seen.
-    """
-    if not len(mesh.vertices):
-        return mesh
-    sums, weights = np.zeros((len(mesh.vertices), 3)), np.zeros(len(mesh.vertices))
-    for found in maps:
-        camera = found.camera
-        pixels, z = camera.project(mesh.vertices.astype(np.float64))
-        inside = (z > 0) & camera.shows(pixels)
-        columns, rows = pixels[inside].astype(int).T
-        agrees = np.abs(found.depth[rows, columns] - z[inside]) < tolerance
-        seen = np.flatnonzero(inside)[agrees]
-        rows, columns = rows[agrees], columns[agrees]
-        weight = found.weight[rows, columns].astype(np.float64)
-        sums[seen] += weight[:, None] * found.colour[rows, columns]
-        weights[seen] += weight
-    known = weights > 0
-    if not known.any():
-        return mesh
-    colours = np.zeros((len(weights), 3))
-    colours[known] = sums[known] / weights[known, None]
-    _, nearest = cKDTree(mesh.vertices[known]).query(mesh.vertices[~known])
-    colours[~known] = colours[known][nearest]
-    return replace(mesh, colours=np.rint(colours).astype(np.uint8))

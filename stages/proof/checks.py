@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from stages.formats import format_of
-from stages.proof import independent_packed, independent_readers
+from stages.proof import independent_packed, independent_readers, usd_validation
 from stages.proof.content import Y_DOWN, Y_UP, FileContent
 from stages.scene import Splats
 
@@ -34,7 +34,7 @@ class Checks:
 
 _PLY = Checks(independent_readers.ply)
 _GLTF = Checks(independent_readers.gltf)
-_USD = Checks(independent_readers.usd, independent_readers.usd_errors)
+_USD = Checks(independent_readers.usd, usd_validation.usd_errors)
 CHECKS = {
     "ply": _PLY,
     "splat": Checks(independent_readers.splat),

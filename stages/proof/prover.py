@@ -3,8 +3,6 @@
 An independent reader reads it back, the rasteriser draws it from held-out cameras, and every value
 is compared with the original. Of more than `_MAX_DRAWN` splats only the central ones are drawn,
 because drawing takes more memory than the splats themselves.
-
-Also: why a file of a lossy format differs from its original: the cause, for a warning.
 """
 
 from __future__ import annotations
@@ -19,11 +17,10 @@ from numpy.typing import NDArray
 
 from stages.base.blocks import blocks
 from stages.base.errors import QualityError
-from stages.base.text import counted, reason_of
+from stages.base.text import reason_of
 from stages.evaluate.image_metrics import IDENTICAL_DB, capped_psnr_db
-from stages.formats import BY_ENDING, Format, format_of
+from stages.formats import BY_ENDING, format_of
 from stages.formats.codecs import CODECS
-from stages.formats.compressed_ply import outlier_shells
 from stages.formats.losses import ENLARGE
 from stages.formats.values import check_finite, drop_undrawable, nonfinite_allowed
 from stages.proof import checks
@@ -34,7 +31,6 @@ from stages.raster.backends import AUTO
 from stages.raster.draw import raster_settings_of, renderer
 from stages.scene import Camera, QuantisedSplats, Splats, View, evenly_spaced, split_held_out
 from stages.scene.framing import orbit_cameras
-from stages.scene.quantiles import median_spacing
 
 _SIDE_PX = 480
 _CAMERAS = 3
@@ -246,34 +242,3 @@ def _drawable(content: FileContent) -> FileContent:
     readers."""
     with nonfinite_allowed():
         return replace(content, splats=drop_undrawable(check_finite(content.splats))[0])
-
-
-_DROP = "`splat edit --drop-floaters` removes outliers"
-
-
-def losses_shown(row: Format, proof: Proof, splats: Splats) -> str:
-    """What was lost in a file of the format `row` made from `splats`, and why; "" where the
-    pictures agree and half of the positions are right to the distance between neighbours."""
-    spacing = median_spacing(splats.means)
-    shifted = proof.median_position_error > spacing > 0
-    if proof.loss_db is None and not shifted:
-        return ""
-    found = []
-    if proof.loss_db is not None:
-        found.append(f"its pictures have a PSNR of {proof.loss_db:.1f} dB")
-    if shifted:
-        ratio = proof.median_position_error / spacing
-        found.append(f"half of the splats are off by {ratio:.1f} distances between neighbours")
-    moved = shifted or proof.figures["max_position_error"] > spacing > 0
-    return f"{' and '.join(found)}: {_cause(row, splats, moved)}"
-
-
-def _cause(row: Format, splats: Splats, moved: bool) -> str:
-    """moved: whether positions differ by more than the distance between neighbours."""
-    if moved and (loss := CODECS[row.ending].position_loss(splats)):
-        return f"it {loss}. {_DROP}."
-    if moved and (count := int(np.count_nonzero(outlier_shells(splats.means)))):
-        return f"{counted(count, 'outlier')} widened the range of its positions. {_DROP}."
-    if moved:
-        return "its positions have too few bits for splats so close together."
-    return f"the format {row.loses}." if row.loses else "the original had lost more already."

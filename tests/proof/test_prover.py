@@ -18,8 +18,8 @@ from stages.base.errors import SplatError
 from stages.formats import splat32
 from stages.formats.losses import losses_of
 from stages.formats.values import check_finite
-from stages.proof import independent_readers
 from stages.proof import prover as proving
+from stages.proof import usd_validation
 from stages.proof.checks import read_back
 from stages.proof.prover import Proof, Prover, cameras_for
 from stages.scene import Splats
@@ -357,7 +357,7 @@ def test_the_usd_librarys_validators_find_no_errors(
     scene: SmallScene, tmp_path: Path, name: str
 ) -> None:
     formats.write(tmp_path / f"a.{name}", scene.splats)
-    assert independent_readers.usd_errors(tmp_path / f"a.{name}") == []
+    assert usd_validation.usd_errors(tmp_path / f"a.{name}") == []
 
 
 @pytest.mark.parametrize("name", ["usda", "usdc", "usdz"])
