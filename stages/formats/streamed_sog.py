@@ -88,20 +88,7 @@ def write(
     try:
         make_folder(partial)
         names = _write_chunks(partial, list(_leaves(tree)), levels, units)
-        counts = [len(level) for level in levels]
-        meta = {
-            "version": 1,
-            "asset": {
-                "generator": "splat",
-                "units": units,
-                **location_fields(splats.origin, splats.place),
-            },
-            "count": sum(counts),
-            "counts": counts,
-            "lodLevels": len(levels),
-            "filenames": names,
-            "tree": _described(tree, levels),
-        }
+        meta = _meta(tree, levels, names, units)
         earlier = _chunk_folders(path)
         _refuse_taken(path, partial, earlier)
         with replacing(path) as temporary:
@@ -116,6 +103,22 @@ def write(
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     html.write_beside(path, splats, units, views, splat_widths(path, splats))
+
+
+def _meta(tree: _Tree, levels: Sequence[Splats], names: list[str], units: str) -> dict[str, Any]:
+    """The content of lod-meta.json. names: of the chunks."""
+    counts = [len(level) for level in levels]
+    finest = levels[0]
+    asset = {"generator": "splat", "units": units}
+    return {
+        "version": 1,
+        "asset": asset | location_fields(finest.origin, finest.place),
+        "count": sum(counts),
+        "counts": counts,
+        "lodLevels": len(levels),
+        "filenames": names,
+        "tree": _described(tree, levels),
+    }
 
 
 def _chunk_folders(path: Path) -> set[Path]:
