@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from stages.base.settings import changed
 from stages.raster.backends import backend_of_settings
 from stages.raster.draw import render
-from stages.run.pipeline import Listener, Pipeline
+from stages.run.listener import Listener
+from stages.run.pipeline import Pipeline
 from stages.run.results import reconstruction_of
 from stages.run.stages import STAGE_NAMES, STAGE_OF, options_of
 from stages.scene import Camera, ExportedAssets, Reconstruction, Splats

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from stages.distributed import blocks, cluster, sfm_chunks
 from stages.distributed.tasks import Executor
-from stages.run.pipeline import Listener, Pipeline
+from stages.run.listener import Listener
+from stages.run.pipeline import Pipeline
 
 
 def distributed(pipeline: Pipeline, address: str | None = None) -> Pipeline:

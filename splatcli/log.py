@@ -8,6 +8,7 @@ import platform
 import shlex
 import sys
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,8 @@ from stages.base.distribution import NAME, VERSION
 from stages.base.libraries import versions
 from stages.base.memory import available_mib
 from stages.base.stage import Numbers, Stage
+from stages.run.listener import Listener
 from stages.run.manifest import Manifest
-from stages.run.pipeline import Listener
 
 _LOGGERS = tuple(map(logging.getLogger, ("splatcli", "stages", "py.warnings")))
 _log = logging.getLogger(__name__)
@@ -64,7 +65,7 @@ def write_failure(error: BaseException) -> None:
     _log.debug("%s", type(error).__name__, exc_info=error)
 
 
-def write_settings(settings: Any) -> None:
+def write_settings(settings: Mapping[str, Any]) -> None:
     """Write the settings (dataclasses by stage name), if there is a log."""
     for name, value in settings.items():
         _log.debug("settings of %s: %s", name, vars(value))

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from inspect import Parameter
-from pathlib import Path
 from typing import Any
 
 import typer
 from typer.core import TyperCommand
 
 from splatcli.options import keyword
-from stages.editing.syntax import OPERATIONS, ParsedOperation, parse_file
+from stages.editing.syntax import OPERATIONS, ParsedOperation
 
-_FILE_OPTION = "ops"
 _ORDER = "splat.order"  # the key of (option, value) pairs in the context's `meta`
 
 
@@ -27,7 +25,7 @@ class OrderedCommand(TyperCommand):
 
 
 def operation_parameters() -> list[Parameter]:
-    """One repeatable keyword parameter for each operation, and --ops."""
+    """One repeatable keyword parameter for each operation."""
     found = []
     for operation in OPERATIONS.values():
         option = typer.Option(
@@ -41,23 +39,10 @@ def operation_parameters() -> list[Parameter]:
             found.append(keyword(name, list[str] | None, option))
         else:
             found.append(keyword(name, bool, option, False))
-    option = typer.Option(
-        f"--{_FILE_OPTION}",
-        help="Text file of operations, one a line, which are inserted here.",
-        show_default=False,
-        metavar="FILE",
-    )
-    return [*found, keyword(_FILE_OPTION, list[str] | None, option)]
+    return found
 
 
 def parsed_operations(ctx: typer.Context) -> list[ParsedOperation]:
-    """The operations in the order on the command line, those of files in the place of --ops. Raises
-    SplatError "edit-ops"."""
-    operations = []
-    for option, value in ctx.meta[_ORDER]:
-        name = option.replace("_", "-")
-        if name == _FILE_OPTION:
-            operations += parse_file(Path(value))
-        elif name in OPERATIONS:
-            operations.append(ParsedOperation(name, value))
-    return operations
+    """The operations in the order on the command line."""
+    named = ((option.replace("_", "-"), value) for option, value in ctx.meta[_ORDER])
+    return [ParsedOperation(name, value) for name, value in named if name in OPERATIONS]

@@ -20,8 +20,8 @@ from rich.text import Text
 
 from splatcli import console
 from stages.base.stage import Numbers, Stage
+from stages.run.listener import Listener
 from stages.run.manifest import Manifest, plain
-from stages.run.pipeline import Listener
 
 _LINE_EVERY_S = 10.0
 _EVENT_EVERY_S = 0.5

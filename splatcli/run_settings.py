@@ -14,7 +14,7 @@ from stages.raster.backends import backend_of, backend_of_settings
 from stages.run.pipeline import Pipeline
 from stages.run.runfolder import is_run_folder
 from stages.run.stages import STAGE_NAMES, STAGE_OF, options_of
-from stages.train.settings import PRESETS
+from stages.train.settings import PRESETS, TrainSettings
 
 DEFAULT_PRESET = "standard"
 
@@ -131,7 +131,7 @@ def of_new_run(given: Mapping[str, Any]) -> dict[str, Any]:
     return combined(defaults(), others, given.get("preset"))
 
 
-def training_summary(settings: Any, given: Mapping[str, Any], preset: str | None) -> str:
+def training_summary(settings: TrainSettings, given: Mapping[str, Any], preset: str | None) -> str:
     """One sentence with the training settings of a resumed run, and where each comes from."""
     by_origin: dict[str, list[str]] = {}
     recorded = f"preset {preset}" if preset else "as recorded in the run"

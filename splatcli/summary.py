@@ -99,15 +99,11 @@ def _quality(manifest: Manifest, name: str) -> str:
 
 
 def _mesh_quality(mesh: dict[str, Any]) -> str:
-    """Triangles, coverage, and distance from the sparse points of the reconstruction."""
-    parts = [
-        f"collision proxy: {mesh.get('triangles', 0):,} triangles",
-        f"{mesh.get('covered_share', 0):.0%} of what the photographs show",
-    ]
-    if mesh.get("sparse_median_distance_share") is not None:
-        apart = f"{mesh['sparse_median_distance_share']:.2%} of its size"
-        parts.append(f"{apart} from the sparse points (median)")
-    return ", ".join(parts)
+    """Triangles and coverage."""
+    return (
+        f"collision proxy: {mesh.get('triangles', 0):,} triangles, "
+        f"{mesh.get('covered_share', 0):.0%} of what the photographs show"
+    )
 
 
 def _as_data(

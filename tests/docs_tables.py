@@ -7,26 +7,63 @@ page; tests/test_docs.py fails when a page is stale.
 from __future__ import annotations
 
 import ast
-import importlib
-import itertools
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 from stages.base.settings import settings_of
 from stages.run.stages import STAGE_NAMES, STAGE_OF
 from tests.layers import LAYERS
-
-if TYPE_CHECKING:
-    from stages.formats.mesh_table import MeshFormat
-    from stages.formats.table import Format
 
 ROOT = Path(__file__).parent.parent
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
 _BLOCK = re.compile(r"(<!-- begin: ([\w-]+) -->\n).*?(<!-- end -->)", re.S)
 
 Rows = Sequence[tuple[str, ...]]
+# What README says of formats: (endings, what they open in, what they keep).
+FORMAT_CELLS = (
+    (("ply",), "nearly every program that reads splats", "everything, float32"),
+    (("splat",), "web viewers", "8-bit colour and rotation; one colour, averaged over the views"),
+    (("glb", "gltf"), "viewers with KHR_gaussian_splatting; others show points", "everything"),
+    (
+        ("usda", "usdc", "usdz"),
+        "USD tools with particle fields (OpenUSD 26.03 or newer)",
+        "everything",
+    ),
+    (
+        ("quantised.glb",),
+        "as `glb`; three.js blends splats of each degree of view dependence by themselves",
+        "sizes, rotations and opacities in 16 bits",
+    ),
+    (
+        ("compressed.ply",),
+        "PlayCanvas, SuperSplat, Spark",
+        "positions and sizes to 1/1000 of those of 256 neighbours, 8-bit colour",
+    ),
+    (
+        ("spz",),
+        "Spark, Open3D, three.js",
+        "sizes to 3 %, 8-bit colour, 4 to 5 bits of view-dependent colour",
+    ),
+    (
+        ("sog",),
+        "PlayCanvas, SuperSplat, Spark",
+        "16-bit positions, 256 sizes and colours, a palette of view-dependent colours",
+    ),
+    (
+        ("lod-meta.json",),
+        "PlayCanvas, SuperSplat, which load nearby chunks first",
+        "as `sog`, in chunks and levels of detail; written by `splat edit`",
+    ),
+    (
+        ("html",),
+        "any browser, from disk, without a network",
+        "everything; also the viewer and the cameras",
+    ),
+    (("mesh.glb",), "game engines, mesh tools", "no splats: triangles for collision"),
+    (("mesh.ply",), "game engines, mesh tools", "no splats: triangles for collision"),
+)
 
 
 def _table(head: tuple[str, ...], rows: Rows) -> str:
@@ -80,40 +117,36 @@ def stages() -> str:
     return _table(("folder", "module", "reads", "version", "options"), rows)
 
 
-def _formats() -> list[Format | MeshFormat]:
-    from stages.formats.mesh_table import MESHES
-    from stages.formats.table import TABLE
-
-    return [*TABLE, *MESHES.values()]
-
-
 def formats() -> str:
+    from stages.formats.mesh_table import MESHES
+    from stages.formats.table import BY_ENDING
+
+    assert [e for endings, _, _ in FORMAT_CELLS for e in endings] == [*BY_ENDING, *MESHES]
+    y_up = {row.ending for row in BY_ENDING.values() if row.y_up}
+    y_up |= {row.ending for row in MESHES.values() if row.y_up}
     rows: list[tuple[str, ...]] = []
-    same = itertools.groupby(_formats(), lambda row: (row.opens_in, row.keeps, row.y_up))
-    for (opens_in, keeps, y_up), group in same:
-        names = ", ".join(f"`{row.ending}`" for row in group)
-        rows.append((names, opens_in, f"{keeps}{'; y up' if y_up else ''}"))
+    for endings, opens_in, keeps in FORMAT_CELLS:
+        names = ", ".join(f"`{ending}`" for ending in endings)
+        rows.append((names, opens_in, f"{keeps}{'; y up' if endings[0] in y_up else ''}"))
     return _table(("`--format`", "opens in", "keeps"), rows)
 
 
 def format_modules() -> str:
-    from stages.formats.mesh_table import MESHES
-    from stages.formats.table import TABLE
+    from stages.formats.codecs import CODECS
+    from stages.formats.mesh_files import CODECS_OF_MESHES
     from stages.proof.checks import CHECKS
 
     rows: list[tuple[str, ...]] = []
-    for row in TABLE:
-        check = CHECKS[row.ending].read
-        places = (row.writer, row.reader, f"{check.__module__}:{check.__qualname__}")
-        rows.append((f"`{row.ending}`", *(_place(place) for place in places)))
-    for mesh in MESHES.values():
-        rows.append((f"`{mesh.ending}`", _place(mesh.writer), "", _place(mesh.independent_reader)))
+    for ending, codec in CODECS.items():
+        functions = (codec.write, codec.read, CHECKS[ending].read)
+        rows.append((f"`{ending}`", *map(_place, functions)))
+    for ending, mesh in CODECS_OF_MESHES.items():
+        rows.append((f"`{ending}`", _place(mesh.write), "", _place(mesh.read)))
     return _table(("format", "writer", "reader", "independent reader"), rows)
 
 
-def _place(text: str) -> str:
-    module, _, name = text.partition(":")
-    return f"`{module.replace('.', '/')}.py` `{name}`"
+def _place(function: Any) -> str:
+    return f"`{function.__module__.replace('.', '/')}.py` `{function.__qualname__}`"
 
 
 def cameras() -> str:
@@ -121,9 +154,9 @@ def cameras() -> str:
 
     rows: list[tuple[str, ...]] = []
     for row in CAMERA_FILES:
-        module = importlib.import_module(f"stages.cameras.{row.module}")
-        points = "yes" if hasattr(module, "read_points") else "no"
-        rows.append((row.description, points, f"`stages/cameras/{row.module}.py`"))
+        points = "yes" if row.read_points else "no"
+        module = row.read.__module__.replace(".", "/")
+        rows.append((row.description, points, f"`{module}.py`"))
     return _table(("file", "sparse points", "read by"), rows)
 
 

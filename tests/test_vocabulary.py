@@ -84,7 +84,6 @@ WORDS = (
     Word("wish(es|ed)?", "request, option"),
     Word(r"\b_?Wanted\b(?!:)", "Options", CODE, exact=True),
     Word(r"(Tell|Say) = |: (Tell|Say)\b", "progress callback", CODE, exact=True),
-    Word("anatom(y|ies)", "byte breakdown"),
     Word(r"distributed[./]far|FarRun", "remote", CODE),
     Word(r"class Place\b", "Location", CODE, exact=True),
     Word("witness(es)?", "visibility constraints"),

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
 from splatcli import console
 from splatcli.arguments import ENDINGS
 from stages import formats
 from stages.base import scratch
 from stages.base.atomic import make_folder
-from stages.base.blocks import progress_reported_to
 from stages.base.errors import UsageError
 from stages.formats import format_of
 from stages.formats.losses import losses_of
-from stages.proof.prover import Prover, cameras_for, losses_shown
+from stages.proof.losses import losses_shown
+from stages.proof.prover import Prover, cameras_for
 from stages.run import results
 from stages.scene import Splats
 
@@ -39,15 +36,15 @@ def convert(
     begun = time.monotonic()
     # the folder of the target is made once there is something to write
     nearest = next(folder for folder in target.absolute().parents if folder.is_dir())
-    with _progress() as begin, scratch.scratch_in(nearest, spare=True):
-        begin(f"reading {source}")
+    with scratch.scratch_in(nearest, spare=True):
+        console.step(f"reading {source}", done=0, total=_STEPS)
         splats, dropped = formats.read_drawable(source)
         _refuse_nothing(source, target, splats)
-        begin(f"writing {target}")
+        console.step(f"writing {target}", done=1, total=_STEPS)
         make_folder(target.parent)
         formats.write(target, splats, units=formats.units_of(source))
         warnings = [*losses_of(rows[1], target.name, splats).values()]
-        begin(f"comparing {target}")
+        console.step(f"comparing {target}", done=2, total=_STEPS)
         found, loss = _proven(source, target, splats)
         warnings += [loss] if loss else []
         if "plain_drawing_db" in found:
@@ -106,27 +103,3 @@ def _proven(source: Path, target: Path, splats: Splats) -> tuple[dict[str, Any],
         figures = figures | {"plain_drawing_db": round(prover.plain_drawing_db(), 2)}
     loss = losses_shown(format_of(target), proof, splats)
     return figures, loss and f"{target.name} differs visibly from {source.name}: {loss}"
-
-
-@contextlib.contextmanager
-def _progress() -> Iterator[Callable[[str], None]]:
-    """Yield a function to call at the beginning of each step. It prints a line or an event; on a
-    terminal it shows a bar with the progress of the step."""
-    done, shown = 0, console.mode.has_notes and console.err.is_terminal
-    columns = TextColumn("{task.description}", markup=False), BarColumn(24), TaskProgressColumn()
-    bar = Progress(*columns, console=console.err, transient=True, disable=not shown)
-    task = bar.add_task("", total=None)
-
-    def begin(label: str) -> None:
-        nonlocal done
-        if not shown:
-            console.step(label, done=done, total=_STEPS)
-        done += 1
-        bar.reset(task, total=None, description=f"{done}/{_STEPS} {label}")
-
-    def update(rows: int, total: int) -> None:
-        bar.update(task, completed=rows, total=total)
-
-    # Some versions of Rich print an empty line at the end of a bar that is off.
-    with bar if shown else contextlib.nullcontext(), progress_reported_to(update):
-        yield begin

@@ -4,33 +4,24 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import typer
+import numpy as np
 
 from splatcli import console
 from splatcli.arguments import RunOrFile
 from splatcli.folders import load_target
 from stages.base import scratch
-from stages.evaluate.evaluation import seconds_per_frame
 from stages.formats import format_of
-from stages.proof.checks import byte_breakdown_of
 from stages.proof.statistics import (
-    DEGREES,
-    GIANT_PART,
     NEEDLE_ASPECT,
     OUTLIER_BOXES,
     Statistics,
-    floats_of,
-    mass_within,
-    memory_of,
     statistics_of,
 )
-from stages.raster.backends import backend_of
 from stages.run import results
 from stages.run.pipeline import Pipeline
-from stages.scene import ExportedFile, Splats
-from stages.scene.framing import orbit_cameras
+from stages.scene import ExportedFile, Splats, parameters_per_splat
 
 _ATTRIBUTES = {
     "means": "positions",
@@ -40,15 +31,10 @@ _ATTRIBUTES = {
     "sh": "colours",
 }
 
-_TIMED_FRAMES = 8
+_FLOAT32_BYTES = 4
 
 
-def info(
-    target: RunOrFile = None,
-    speed: Annotated[
-        bool, typer.Option("--speed", help="Draw some pictures too: frames a second, here.")
-    ] = False,
-) -> None:
+def info(target: RunOrFile = None) -> None:
     """Print statistics of a file or a run: splats, SH degrees, bounds, bytes, and warnings."""
     with scratch.scratch_in(Path(tempfile.gettempdir()), spare=True):
         splats, pipeline = load_target(target, strict=False)
@@ -58,8 +44,6 @@ def info(
         facts = {**_about_file(target, len(splats)), **facts}
     if pipeline is not None:
         facts = {**_about_run(pipeline), **facts}
-    if speed and statistics.count:
-        facts |= _speed(splats, pipeline or results.run_around(target))
     warnings = warnings_of(statistics)
     if console.mode.as_json:
         console.emit("info", **facts, warnings=dict(warnings))
@@ -90,40 +74,9 @@ def describe(splats: Splats, statistics: Statistics) -> dict[str, Any]:
     facts["origin"] = [float(value) for value in splats.origin]
     if splats.place is not None:
         facts["place"] = splats.place.to_json()
-    return facts | _memory(splats)
-
-
-def _memory(splats: Splats) -> dict[str, Any]:
-    """Floats and bytes in memory for each splat and for all, and the mass of a Gaussian within 1, 2
-    and 3 standard deviations."""
-    one, every = (memory_of(splats.sh_degree, count) for count in (1, len(splats)))
-    return {
-        "floats_per_splat": floats_of(splats.sh_degree),
-        "floats_per_splat_by_degree": {str(degree): floats_of(degree) for degree in DEGREES},
-        "memory_bytes_per_splat": one,
-        "memory_bytes": every,
-        "mass_share_within_sigmas": {str(n): round(mass_within(n), 4) for n in (1, 2, 3)},
-    }
-
-
-def _speed(splats: Splats, pipeline: Pipeline | None) -> dict[str, Any]:
-    """Frames a second from some of the photographs' cameras, at the size of the training; from
-    cameras around the splats if there are no photographs."""
-    console.note_compiling()
-    views = results.views_of(pipeline)
-    chosen = views[:: max(1, len(views) // _TIMED_FRAMES)][:_TIMED_FRAMES]
-    cameras = [splats.draw_settings.camera(v.camera) for v in chosen] or orbit_cameras(
-        splats, _TIMED_FRAMES, 0.9
-    )
-    backend = results.backend_of_run(pipeline)
-    seconds = seconds_per_frame(splats, cameras, backend)
-    return {
-        "frames_a_second": round(1 / float(seconds.mean()), 2),
-        "frame_width": cameras[0].width,
-        "frame_height": cameras[0].height,
-        "frames_timed": len(cameras),
-        "backend": backend_of(backend).name,
-    }
+    facts["floats_per_splat"] = int(parameters_per_splat(np.array(splats.sh_degree)))
+    facts["memory_bytes"] = _FLOAT32_BYTES * facts["floats_per_splat"] * statistics.count
+    return facts
 
 
 def warnings_of(statistics: Statistics) -> list[tuple[str, str]]:
@@ -137,9 +90,7 @@ def warnings_of(statistics: Statistics) -> list[tuple[str, str]]:
         "too-large": "larger than numbers go: no viewer can draw them.",
         "transparent": "below an opacity of 1/255, and so never seen.",
         "needles": f"needles, over {NEEDLE_ASPECT:g} times as long as wide.",
-        "giants": f"giants, larger than {GIANT_PART:g} of the scene.",
         "outliers": f"outliers, over {OUTLIER_BOXES:g} times as far out as the middle 98 %.",
-        "duplicates": "duplicates of others.",
     }
     for code, what in kinds.items():
         if count := statistics.troubles.get(code, 0):
@@ -155,13 +106,7 @@ def _share(count: int, statistics: Statistics) -> str:
 def _about_file(path: Path, count: int) -> dict[str, Any]:
     size = format_of(path).size_bytes(path)
     facts: dict[str, Any] = {"file": str(path), "size_bytes": size}
-    breakdown = byte_breakdown_of(path)
-    if breakdown.unknown:
-        facts["bytes_per_splat_unknown"] = breakdown.unknown
-    elif count:
-        name = "bytes_per_splat_unpacked" if breakdown.unpacked else "bytes_per_splat"
-        facts[name] = {what: round(n / count, 2) for what, n in breakdown.parts.items()}
-    return facts
+    return facts | ({"bytes_per_splat": round(size / count, 2)} if count else {})
 
 
 def _about_run(pipeline: Pipeline) -> dict[str, Any]:

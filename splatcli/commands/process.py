@@ -13,9 +13,8 @@ from stages.base.errors import UsageError
 from stages.base.settings import changed
 from stages.cameras.table import read_cameras
 from stages.run import runfolder
-from stages.run.attempt import Listeners
-from stages.run.pipeline import Listener, Pipeline
-from stages.run.precompile import PrecompileListener
+from stages.run.listener import Listener, Listeners
+from stages.run.pipeline import Pipeline
 from stages.run.runfile import RunFile
 from stages.run.stages import STAGE_NAMES
 from stages.sfm.known.match_cameras import check_split
@@ -140,8 +139,6 @@ def _run(
             "folders of the stages; settings of stages that never began are the defaults."
         )
     listeners: list[Listener] = [log.LogListener(), progress.listener_for(console.mode)]
-    if until is None:
-        listeners.insert(0, PrecompileListener(settings["train"].backend))
     if view:
         listeners.insert(0, _live_training(pipeline))
     pipeline.run(settings, until=until, may_run=may_run, listener=Listeners(*listeners))

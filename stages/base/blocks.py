@@ -1,16 +1,10 @@
-"""Work on many rows a block at a time, so that temporary arrays stay small.
-
-Progress goes to a callback: `with progress_reported_to(callback): formats.read(path)`. Readers and
-writers pass over the rows more than once (values, order, one attribute after another); the
-callback gets the progress of the current pass.
-"""
+"""Work on many rows a block at a time, so that temporary arrays stay small."""
 
 from __future__ import annotations
 
 import mmap
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from contextvars import ContextVar
+from collections.abc import Iterator
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,18 +12,6 @@ from numpy.typing import NDArray
 from stages.base.scratch import release_scratch_pages
 
 ROWS = 1 << 16  # 16 MB of splats of degree 3
-ProgressCallback = Callable[[int, int], None]  # (done, total) of a pass, mostly rows
-_callback: ContextVar[ProgressCallback | None] = ContextVar("progress", default=None)
-
-
-@contextmanager
-def progress_reported_to(callback: ProgressCallback) -> Iterator[None]:
-    """Call `callback` during every pass inside the block, on the working thread."""
-    token = _callback.set(callback)
-    try:
-        yield
-    finally:
-        _callback.reset(token)
 
 
 def blocks(count: int, rows: int = ROWS) -> Iterator[slice]:
@@ -37,20 +19,6 @@ def blocks(count: int, rows: int = ROWS) -> Iterator[slice]:
     for start in range(0, count, rows):
         yield slice(start, min(start + rows, count))
         release_scratch_pages()
-
-
-def reported_blocks(count: int, rows: int = ROWS) -> Iterator[slice]:
-    """`blocks` with progress reports, for a slow pass."""
-    for part in blocks(count, rows):
-        yield part
-        report_progress(part.stop, count)
-
-
-def report_progress(done: int, total: int) -> None:
-    """Report the progress of a pass that does not go by rows."""
-    callback = _callback.get()
-    if callback is not None:
-        callback(done, total)
 
 
 def release_mapped_pages(mapped: NDArray[np.generic]) -> None:

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from stages.base.bad_files import CAMERAS, BadFileError, reading
@@ -56,14 +55,14 @@ def read(path: Path) -> CameraFile:
     with reading(path, CAMERAS):
         data = _largest(path)
         shots = data["shots"]
-        optics = {name: optics_of(camera) for name, camera in data["cameras"].items()}
+        optics = {name: _optics(camera) for name, camera in data["cameras"].items()}
         missing = {str(shot["camera"]) for shot in shots.values()} - optics.keys()
         if missing:
             raise BadFileError(f"there is no camera {min(missing)[:80]!r}")
         turns = np.array([shot["rotation"] for shot in shots.values()], np.float64).reshape(-1, 3)
         shifts = np.array([shot["translation"] for shot in shots.values()], np.float64)
         with np.errstate(all="ignore"):  # `camera_file` checks the result
-            rotations = rotations_of(turns)
+            rotations = Rotation.from_rotvec(turns).as_matrix()
         poses = np.concatenate([rotations, shifts.reshape(-1, 3, 1)], axis=2)
         own = [optics[shot["camera"]] for shot in shots.values()]
         found = camera_file(path.parent / "images", list(shots), own, poses)
@@ -113,7 +112,7 @@ def _largest(path: Path) -> dict[str, Any]:
     return largest
 
 
-def optics_of(camera: Mapping[str, Any]) -> tuple[list[float], Lens]:
+def _optics(camera: Mapping[str, Any]) -> tuple[list[float], Lens]:
     """(width, height, fx, fy, cx, cy in pixels; the lens)."""
     width, height = float(camera["width"]), float(camera["height"])
     kind = str(camera.get("projection_type", "perspective"))
@@ -131,8 +130,3 @@ def optics_of(camera: Mapping[str, Any]) -> tuple[list[float], Lens]:
     centre = (width / 2 + side * cx, height / 2 + side * cy)
     lens = Lens("fisheye" if kind in _FISHEYE else "perspective", tuple(k), tangential=p)
     return [width, height, side * fx, side * fy, *centre], lens
-
-
-def rotations_of(turns: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[V, 3, 3] of axis-angle vectors [V, 3]."""
-    return np.asarray(Rotation.from_rotvec(turns).as_matrix())

@@ -28,7 +28,8 @@ from stages.distributed.partition import Cell
 from stages.distributed.tasks import Executor, OpenExecutor, RunTask, resources_of, run_all
 from stages.evaluate.evaluation import image_renderer, load_evaluation_views
 from stages.raster.backends import backend_of_settings
-from stages.run.pipeline import Listener, Pipeline
+from stages.run.listener import Listener
+from stages.run.pipeline import Pipeline
 from stages.scene import (
     DrawSettings,
     Reconstruction,

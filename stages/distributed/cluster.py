@@ -29,7 +29,7 @@ from stages.distributed.tasks import (
     TaskResult,
     run_task,
 )
-from stages.run.pipeline import Listener
+from stages.run.listener import Listener
 from stages.run.stages import STAGE_NAMES, STAGE_OF
 
 _LOCAL = re.compile(r"local:([1-9]\d{0,3})")

@@ -21,9 +21,9 @@ from stages.base.disk import disk_full
 from stages.base.distribution import install_command
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Numbers, Stage
+from stages.run.listener import Listener
 from stages.run.lock import locked
 from stages.run.manifest import MANIFEST, Manifest
-from stages.run.pipeline import Listener
 from stages.run.request import REQUEST
 from stages.run.runfile import RUN_FILE
 from stages.train.checkpoint import FILE_NAME

@@ -9,7 +9,8 @@ from typing import Any
 
 from stages.base.stage import Report
 from stages.distributed.tasks import ChunkTask, Executor, OpenExecutor, Resources, run_all
-from stages.run.pipeline import Listener, Pipeline
+from stages.run.listener import Listener
+from stages.run.pipeline import Pipeline
 from stages.sfm.worker.chunks import CHUNK_MEMORY_MIB, Chunk
 
 

@@ -17,9 +17,9 @@ from typing import Any, Protocol
 from stages.base.errors import CRASHED, Family, Interrupted, SplatError
 from stages.base.text import reason_of
 from stages.distributed.remote import Location, local_copies
-from stages.run.attempt import Listeners
 from stages.run.failures import as_splat_error
-from stages.run.pipeline import Listener, Pipeline
+from stages.run.listener import Listener, Listeners
+from stages.run.pipeline import Pipeline
 from stages.sfm.worker.chunks import Chunk, run_chunk
 from stages.train.cap import needed_mib
 

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.blocks import blocks, reported_blocks
+from stages.base.blocks import blocks
 from stages.formats.values import empty_rows
 from stages.raster.definition import ALPHA_MAX
 from stages.scene import SH_C0, Splats, logit, morton
@@ -114,7 +114,7 @@ def _partners(
         cheapest[to][better] = cost[better]
         partners[to][better] = to.start + better + step
 
-    for block in reported_blocks(count, _BLOCK):
+    for block in blocks(count, _BLOCK):
         rows = order[block.start : block.stop + _WINDOW]
         part = Moments.of(splats, rows)
         weights = part.masses if removal is None else removal.weights[rows]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from stages import formats
 from stages.base.atomic import partial_prefix
-from stages.base.blocks import reported_blocks
+from stages.base.blocks import blocks
 from stages.base.errors import SplatError, UsageError
 from stages.editing import expression, levels, regions, transform
 from stages.editing.decimate import FAR_ROUND_SHARE, NEAR_ROUND_SHARE, decimate
@@ -94,7 +94,7 @@ def _keeping(condition: Callable[[Splats], NDArray[np.bool_]]) -> Operation:
 
     def kept(scene: EditedScene) -> EditedScene:
         found = np.empty(len(scene.splats), bool)
-        for rows in reported_blocks(len(found)):
+        for rows in blocks(len(found)):
             found[rows] = condition(scene.splats.take(rows))
         return scene.with_splats(select_rows(scene.splats, found))
 

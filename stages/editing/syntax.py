@@ -1,15 +1,11 @@
-"""The syntax of operations: on the command line, and in a file with one operation a line.
+"""The syntax of operations on the command line.
 
-To add an operation, add a row to `OPERATIONS` and a case to `operations.prepare`.
+To add an operation, add a row to `OPERATIONS` and a case to `operations._prepare`.
 """
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
-from pathlib import Path
-
-from stages.base.errors import SplatError, UsageError
 
 
 @dataclass(frozen=True)
@@ -27,7 +23,7 @@ class OperationSyntax:
     help: str
 
 
-_REGION = "box:...|sphere:...|hull:FILE|lasso:..."
+_REGION = "box:...|sphere:...|lasso:..."
 OPERATIONS = {
     operation.name: operation
     for operation in (
@@ -60,39 +56,3 @@ class ParsedOperation:
 
     def __str__(self) -> str:
         return f"--{self.name} {self.value}".rstrip()
-
-
-def parse_file(path: Path) -> list[ParsedOperation]:
-    """The operations of a text file, one a line. Leading dashes and quotes around the value are
-    optional; # begins a comment. Raises SplatError "edit-ops"."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (FileNotFoundError, IsADirectoryError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is no text"
-        raise _invalid(f"{path} cannot be read: {reason}.") from error
-    operations = []
-    for number, line in enumerate(lines, 1):
-        line = re.sub(r"(^|\s)#.*", "", line).strip()
-        if line:
-            operations.append(_parse_line(line, f"{path}, line {number}"))
-    return operations
-
-
-def _parse_line(line: str, where: str) -> ParsedOperation:
-    name, value = re.fullmatch(r"(?:--)?([^\s=]*)[\s=]*(.*)", line).groups()  # type: ignore[union-attr]
-    if name not in OPERATIONS:
-        raise _invalid(f"{where}: {name[:40]!r} is no operation.")
-    if value[:1] in ("'", '"') and value[-1] == value[0] and len(value) > 1:
-        value = value[1:-1]
-    if bool(value) != bool(OPERATIONS[name].takes):
-        raise _invalid(f"{where}: {name} takes {OPERATIONS[name].takes or 'no value'}.")
-    return ParsedOperation(name, value)
-
-
-def _invalid(given: str) -> SplatError:
-    return UsageError(
-        "edit-ops",
-        given=given,
-        wanted=f"Operations, one a line: {', '.join(OPERATIONS)}.",
-        hint="For example: crop box:-1,-1,-1,1,1,1",
-    )

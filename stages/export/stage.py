@@ -11,7 +11,6 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from pkgutil import resolve_name
 from typing import Any
 
 from stages import formats
@@ -22,7 +21,7 @@ from stages.base.text import counted
 from stages.export.settings import ExportSettings
 from stages.formats import Format, format_of
 from stages.formats.losses import losses_of
-from stages.formats.mesh_files import fault_of
+from stages.formats.mesh_files import CODECS_OF_MESHES
 from stages.formats.output_formats import (
     mesh_formats,
 )
@@ -109,8 +108,9 @@ def _write_meshes(
     files = []
     for row in rows:
         path = folder / f"{settings.name}.{row.ending}"
-        resolve_name(row.writer)(path, made.mesh, reconstruction.units)
-        if fault := fault_of(path, row, made.mesh):
+        codec = CODECS_OF_MESHES[row.ending]
+        codec.write(path, made.mesh, reconstruction.units)
+        if fault := codec.fault_of(path, made.mesh):
             raise _failed(path, fault, "mesh")
         files.append(ExportedFile(row.ending, path.name, path.stat().st_size))
     return files

@@ -5,15 +5,16 @@ them so. The axes and encodings of a format stay inside its module.
 
 To add a format, in six steps:
 1. Write `write(path, splats, *, units)` in a module here. Its splats are all drawable. It writes
-   through `base.atomic.replacing`, one block of `base.blocks.reported_blocks` at a time.
+   through `base.atomic.replacing`, one block of `base.blocks.blocks` at a time.
 2. Write `read(path)` in the same module, or in one beside it. It raises
    `base.bad_files.BadFileError`, or what damaged bytes cause in Python and NumPy; `formats.read`
    turns both into SplatError, and checks the values.
-3. Add a row to `table.TABLE`. `splat export`, `convert`, `verify`, `info` and their help, the
-   fuzzer and the tests of all formats are driven by this table.
-4. Write an independent reader (of a library, or of raw bytes) and a byte breakdown in
-   `stages.proof`, and add their row to `stages.proof.checks.CHECKS`.
-5. Run `python -m tests.docs_tables`, which writes the tables of the documentation.
+3. Add a row to `table.TABLE`, and its functions to `codecs.CODECS`. `splat export`, `convert`,
+   `verify`, `info` and their help, the fuzzer and the tests of all formats are driven by the table.
+4. Write an independent reader (of a library, or of raw bytes) in `stages.proof`, and add its row
+   to `stages.proof.checks.CHECKS`.
+5. Say in `tests.docs_tables.FORMAT_CELLS` what the format opens in and keeps, and run
+   `python -m tests.docs_tables`, which writes the tables of the documentation.
 6. Run `pytest tests/formats tests/proof tests/fuzz`.
 """
 
@@ -23,7 +24,6 @@ import re
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 from stages.base.atomic import remove_abandoned_files
@@ -69,7 +69,7 @@ def write(
     Returns how many splats could not be drawn (values not finite, or too large) and were left out.
     Raises SplatError as `format_of`, or what keeps the file from being written.
     """
-    from stages.formats import offset, values  # they load NumPy, which the table does without
+    from stages.formats import codecs, offset, values  # they load NumPy, the table does not
 
     row = format_of(path)
     remove_abandoned_files(Path(path).parent)
@@ -77,7 +77,7 @@ def write(
     if row.streamed:
         more["coarser"] = coarser
     splats, dropped = values.drop_undrawable(splats)
-    resolve_name(row.writer)(Path(path), splats, units=units, **more)
+    codecs.CODECS[row.ending].write(Path(path), splats, units=units, **more)
     if not row.holds_origin:
         offset.write_offset(Path(path), row, splats, units)
     return dropped
@@ -89,11 +89,11 @@ def read(path: Path, *, strict: bool = True) -> Splats:
     strict: whether a value that is not finite makes the file unreadable. Raises SplatError as
     `format_of`, or "splats-unreadable".
     """
-    from stages.formats import offset, values  # they load NumPy, which the table does without
+    from stages.formats import codecs, offset, values  # they load NumPy, the table does not
 
     path, row = Path(path), format_of(path)
     with nullcontext() if strict else values.nonfinite_allowed(), reading(path):
-        splats: Splats = values.check_finite(resolve_name(row.reader)(path))
+        splats = values.check_finite(codecs.CODECS[row.ending].read(path))
     if row.holds_origin or not offset.offset_path(path).exists():
         return splats
     with reading(offset.offset_path(path)):
@@ -114,7 +114,7 @@ def read_drawable(path: Path) -> tuple[Splats, int]:
 def units_of(path: Path) -> str:
     """ "metres" where the file, or the one beside it that holds its origin, declares them as ours
     do; else "arbitrary". Raises SplatError as `format_of`, or "splats-unreadable"."""
-    from stages.formats import offset  # it loads NumPy, which the table does without
+    from stages.formats import codecs, offset  # they load NumPy, the table does not
 
     path, row = Path(path), format_of(path)
     if not row.holds_origin:
@@ -122,9 +122,9 @@ def units_of(path: Path) -> str:
             return "arbitrary"
         with reading(offset.offset_path(path)):
             declared = offset.read_units(path)
-    elif row.units:
+    elif units := codecs.CODECS[row.ending].units:
         with reading(path):
-            declared = resolve_name(row.units)(path)
+            declared = units(path)
     else:
         with reading(path), path.open("rb") as file:
             declared = "metres" if _METRES.search(file.read(_START_BYTES)) else ""

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base import scratch
-from stages.base.blocks import blocks, reported_blocks
+from stages.base.blocks import blocks
 
 SIZE = 256
 _SCALAR_ROUNDS, _VECTOR_ROUNDS = 30, 6
@@ -90,13 +90,13 @@ def vector_palette(
     sample = np.sort(rng.permutation(rows)[:_SAMPLE])
     coarse = _centres(vectors[sample], min(_COARSE, max(1, size // 8)), rng)
     cluster = np.empty(len(rows), np.int32)
-    for part in reported_blocks(len(rows)):
+    for part in blocks(len(rows)):
         cluster[part] = _assigned(vectors[rows[part]], coarse)
     # rows grouped by cluster, otherwise in their order
     rows = rows[np.argsort(cluster, kind="stable")]
     ends = np.cumsum(np.bincount(cluster, minlength=len(coarse)))
     used = 1
-    for k in reported_blocks(len(coarse), 1):
+    for k in blocks(len(coarse), 1):
         members = rows[ends[k.start - 1] if k.start else 0 : ends[k.start]]
         if not len(members):
             continue
@@ -113,7 +113,7 @@ def _distinct(vectors: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[n
     """(first row of each distinct vector, which one each row is), compared by a 64-bit hash."""
     factors = np.random.default_rng(1).integers(1, 1 << 63, vectors.shape[1], np.uint64) | 1
     sums = np.empty(len(vectors), np.uint64)
-    for rows in reported_blocks(len(vectors)):
+    for rows in blocks(len(vectors)):
         bits = np.ascontiguousarray(vectors[rows] + np.float32(0)).view(np.uint32)  # -0 is 0
         sums[rows] = (bits * factors).sum(axis=1)
     _, first, which = np.unique(sums, return_index=True, return_inverse=True)

@@ -16,7 +16,6 @@ from pathlib import Path
 
 from stages.base.atomic import replacing
 from stages.base.bad_files import BadFileError
-from stages.base.blocks import report_progress
 from stages.formats import ply
 from stages.formats.inflate import check_size
 from stages.page import document
@@ -42,7 +41,7 @@ def write(
     scene = document.scene_data(path.stem, splats, shots, units=units, source=path.name)
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(document.head(scene).encode("utf-8"))
-        for chunk in _chunks(_zipped(ply.blocks(splats, units))):
+        for chunk in _chunks(_zipped(ply.file_blocks(splats, units))):
             file.write(document.CHUNK_START.encode("ascii"))
             file.write(base64.b64encode(chunk))
             file.write(document.CHUNK_END.encode("ascii"))
@@ -98,12 +97,12 @@ def read(path: Path) -> Splats:
     with tempfile.TemporaryDirectory(prefix="splat-") as folder:
         inside = Path(folder) / "inside.ply"
         with inside.open("wb") as file:
-            for block in unzipped(path):
+            for block in _unzipped(path):
                 file.write(block)
         return ply.read(inside)
 
 
-def unzipped(path: Path) -> Iterator[bytes]:
+def _unzipped(path: Path) -> Iterator[bytes]:
     """The .ply inside, in blocks; each script element is one line."""
     start, end = (re.escape(t.encode("ascii")) for t in (document.CHUNK_START, document.CHUNK_END))
     wanted = re.compile(start + rb"([A-Za-z0-9+/=]*)" + end)
@@ -124,7 +123,6 @@ def unzipped(path: Path) -> Iterator[bytes]:
                     check_size(unpacked, size)
                     yield block
                     data = unpacker.unconsumed_tail
-                    report_progress(page.tell(), size)
         except (zlib.error, binascii.Error) as error:
             raise BadFileError(f"the splats in it are damaged ({error})") from error
     if not unpacker.eof:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
-from pkgutil import resolve_name
 
+from stages.formats.codecs import CODECS
 from stages.formats.offset import is_located, offset_path
 from stages.formats.table import Format
 from stages.formats.values import drop_undrawable
@@ -20,10 +20,11 @@ def losses_of(row: Format, file_name: str, splats: Splats) -> dict[str, str]:
     splats = drop_undrawable(splats)[0]
     if not len(splats):
         return found
-    if row.position_loss and (loss := resolve_name(row.position_loss)(splats)):
+    codec = CODECS[row.ending]
+    if loss := codec.position_loss(splats):
         advice = "`splat edit --drop-floaters` removes outliers; .ply, .glb and .usdz hold them."
         found["range"] = f"{file_name} {loss}. {advice}"
-    if row.size_loss and (loss := resolve_name(row.size_loss)(splats)):
+    if loss := codec.size_loss(splats):
         found["size"] = f"{file_name} {loss}. {ENLARGE}."
     if splats.draw_settings.antialias and not row.drawn_antialiased:
         found["drawing"] = (

@@ -6,8 +6,9 @@ both coincide. .glb: the same, y up. Specification: glTF 2.0, 3.7.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from pkgutil import resolve_name
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,6 @@ from pygltflib import GLTF2
 
 from stages.base.atomic import replacing
 from stages.formats.gltf_file import Attribute, asset, buffer_fields, write_glb
-from stages.formats.mesh_table import MeshFormat
 from stages.formats.ply_header import header_text
 from stages.scene.flip import FLIP, flipped_place
 from stages.scene.light import linear_light
@@ -28,20 +28,34 @@ _FACE = np.dtype([("count", "u1"), ("vertices", "<i4", 3)])
 _TRIANGLES = 4
 # Not taken from the writer: its error must not check itself.
 _Y_UP = np.array([1.0, -1.0, -1.0])
+_Triangles = tuple[NDArray[Any], NDArray[Any]]  # vertices [V, 3], faces [F, 3]
 
 
-def fault_of(path: Path, row: MeshFormat, mesh: Mesh) -> str:
-    """What is wrong with a file that should hold `mesh`, as the independent reader finds it; "" if
-    nothing is."""
-    try:
-        vertices, faces = resolve_name(row.independent_reader)(path)
-    except Exception as error:  # whatever the reader raises: the file is wrong
-        return f"another reader refused it ({error})"
-    if len(vertices) != len(mesh.vertices) or len(faces) != len(mesh.faces):
-        return f"it holds {len(vertices)} vertices and {len(faces)} triangles"
-    if not np.array_equal(vertices, mesh.vertices) or not np.array_equal(faces, mesh.faces):
-        return "its vertices or triangles are not those that were written"
-    return ""
+@dataclass(frozen=True)
+class MeshCodec:
+    """The functions of one mesh format.
+
+    Attributes:
+        write: (path, mesh, units).
+        read: (path) -> (vertices [V, 3], faces [F, 3]) in the world's axes. It shares no code with
+            the writer and may raise anything.
+    """
+
+    write: Callable[[Path, Mesh, str], None]
+    read: Callable[[Path], _Triangles]
+
+    def fault_of(self, path: Path, mesh: Mesh) -> str:
+        """What is wrong with a file that should hold `mesh`, as the independent reader finds it; ""
+        if nothing is."""
+        try:
+            vertices, faces = self.read(path)
+        except Exception as error:  # whatever the reader raises: the file is wrong
+            return f"another reader refused it ({error})"
+        if len(vertices) != len(mesh.vertices) or len(faces) != len(mesh.faces):
+            return f"it holds {len(vertices)} vertices and {len(faces)} triangles"
+        if not np.array_equal(vertices, mesh.vertices) or not np.array_equal(faces, mesh.faces):
+            return "its vertices or triangles are not those that were written"
+        return ""
 
 
 def write_ply(path: Path, mesh: Mesh, units: str) -> None:
@@ -65,7 +79,7 @@ def _ply_header(mesh: Mesh, units: str) -> bytes:
     return header_text(units, mesh.origin, mesh.place, lines, NOTE)
 
 
-def read_ply(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
+def read_ply(path: Path) -> _Triangles:
     """(vertices [V, 3], faces [F, 3]) by plyfile, in the world's axes."""
     data = PlyData.read(str(path))
     vertices = np.stack([data["vertex"][axis] for axis in "xyz"], axis=1)
@@ -132,7 +146,7 @@ def _described(attributes: dict[str, Attribute], indices: Attribute) -> dict[str
     }
 
 
-def read_glb(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
+def read_glb(path: Path) -> _Triangles:
     """(vertices [V, 3], faces [F, 3]) by pygltflib, rotated from y up to the world's axes."""
     document = GLTF2().load(str(path))
     assert document is not None
@@ -147,3 +161,9 @@ def read_glb(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
 
     vertices = values(primitive.attributes.POSITION, "<f4", 3).reshape(-1, 3) * _Y_UP
     return vertices, values(primitive.indices, "<u4", 1).astype(np.int64).reshape(-1, 3)
+
+
+CODECS_OF_MESHES = {
+    "mesh.glb": MeshCodec(write_glb_mesh, read_glb),
+    "mesh.ply": MeshCodec(write_ply, read_ply),
+}

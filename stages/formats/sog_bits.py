@@ -7,7 +7,6 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from pkgutil import resolve_name
 
 from stages import formats
 from stages.formats.axes import smallest_rotations
@@ -15,6 +14,7 @@ from stages.formats.sog_quantisation import (
     BitDepths,
     palette_bits,
     quantise_attribute,
+    quantise_for_sog,
     quantise_splats,
 )
 from stages.formats.table import Format
@@ -92,8 +92,8 @@ def file_size_bytes(
     row: Format, splats: Splats, depths: dict[str, int], units: str, views: tuple[View, ...]
 ) -> int:
     """The size of `splats` as a file of the format, found by writing it. depths: see `choose_bits`;
-    empty for formats without a quantiser."""
-    held = resolve_name(row.quantiser)(splats, BitDepths(**depths)) if depths else splats
+    empty for formats without."""
+    held = quantise_for_sog(splats, BitDepths(**depths)) if depths else splats
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / row.file_name("scene")
         formats.write(path, held, units=units, views=views)

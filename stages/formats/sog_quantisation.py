@@ -7,7 +7,6 @@ writer and its readers stay unchanged.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
-from pkgutil import resolve_name
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,10 +96,9 @@ def splats_to_write(row: Format, quantised: QuantisedSplats) -> Splats:
         sh = quantised.flat_dc[:, None].astype(splats.sh.dtype)
         splats = replace(splats.with_sh_degree(0), sh=sh)
     splats = drop_undrawable(splats)[0]
-    if not row.quantiser or quantised.sog_bits is None:
+    if not row.has_bit_depths or quantised.sog_bits is None:
         return splats
-    found: Splats = resolve_name(row.quantiser)(splats, BitDepths(**quantised.sog_bits))
-    return found
+    return quantise_for_sog(splats, BitDepths(**quantised.sog_bits))
 
 
 def _positions(means: NDArray[np.floating], bits: int) -> NDArray[np.float32]:

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
-from stages.base.blocks import blocks, reported_blocks
+from stages.base.blocks import blocks
 from stages.base.text import counted
 from stages.formats import smallest_three
 from stages.formats.spz_read import ANTIALIASED, COLOUR_SCALE, HEADER, MAGIC, MAGNITUDE
@@ -68,7 +68,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
     ):
         packed.write(header)
         for array in arrays:
-            for rows in reported_blocks(len(splats)):
+            for rows in blocks(len(splats)):
                 packed.write(np.ascontiguousarray(array(splats.take(rows))).data)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError
-from stages.base.blocks import reported_blocks
+from stages.base.blocks import blocks
 from stages.formats import smallest_three
 from stages.formats.inflate import check_size, read_rest, read_rows, read_zstd_frame
 from stages.formats.values import allocate, logits_of, unit_quaternions
@@ -129,15 +129,6 @@ def _table(file: BinaryIO, size: int) -> tuple[Header, bytes, list[tuple[int, in
     return values, extensions, list(_TABLE_ROW.iter_unpack(table))
 
 
-def packed_sizes(path: Path) -> list[int]:
-    """Compressed bytes of each array of version 4; [] for versions with one gzip stream."""
-    with path.open("rb") as file:
-        if file.read(len(MAGIC)) != MAGIC:
-            return []
-        file.seek(0)
-        return [packed for packed, _ in _table(file, path.stat().st_size)[2]]
-
-
 def _is_y_up(records: bytes) -> bool:
     """Whether the axes are right, up, back; False if they are ours. Other extensions (limits for
     cameras) are ignored. Raises BadFileError for other axes."""
@@ -157,7 +148,7 @@ def _decoded(head: Header, arrays: list[NDArray[np.uint8]]) -> Splats:
     """The splats in the axes of the file."""
     positions, opacities, colours, scales, rotations, sh = arrays
     splats = allocate(len(positions), head.degree)
-    for rows in reported_blocks(len(positions)):
+    for rows in blocks(len(positions)):
         out = splats.take(rows)
         padded = np.zeros((len(out), 3, 4), np.uint8)
         padded[:, :, 1:] = positions[rows].reshape(-1, 3, 3)

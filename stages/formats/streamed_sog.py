@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import make_folder, partial_prefix, replacing
 from stages.base.bad_files import BadFileError, reading
-from stages.base.blocks import reported_blocks
+from stages.base.blocks import blocks
 from stages.base.errors import UsageError
 from stages.formats import html, sog
 from stages.formats.json_fields import agreed, located, location_fields, whole
@@ -88,20 +88,7 @@ def write(
     try:
         make_folder(partial)
         names = _write_chunks(partial, list(_leaves(tree)), levels, units)
-        counts = [len(level) for level in levels]
-        meta = {
-            "version": 1,
-            "asset": {
-                "generator": "splat",
-                "units": units,
-                **location_fields(splats.origin, splats.place),
-            },
-            "count": sum(counts),
-            "counts": counts,
-            "lodLevels": len(levels),
-            "filenames": names,
-            "tree": _described(tree, levels),
-        }
+        meta = _meta(tree, levels, names, units)
         earlier = _chunk_folders(path)
         _refuse_taken(path, partial, earlier)
         with replacing(path) as temporary:
@@ -116,6 +103,22 @@ def write(
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     html.write_beside(path, splats, units, views, splat_widths(path, splats))
+
+
+def _meta(tree: _Tree, levels: Sequence[Splats], names: list[str], units: str) -> dict[str, Any]:
+    """The content of lod-meta.json. names: of the chunks."""
+    counts = [len(level) for level in levels]
+    finest = levels[0]
+    asset = {"generator": "splat", "units": units}
+    return {
+        "version": 1,
+        "asset": asset | location_fields(finest.origin, finest.place),
+        "count": sum(counts),
+        "counts": counts,
+        "lodLevels": len(levels),
+        "filenames": names,
+        "tree": _described(tree, levels),
+    }
 
 
 def _chunk_folders(path: Path) -> set[Path]:
@@ -194,7 +197,7 @@ def _write_chunks(
         used = [leaf for leaf in leaves if len(leaf.rows[level])]
         held: list[_Rows] = []
         first = len(names)
-        for index in reported_blocks(len(used), 1):
+        for index in blocks(len(used), 1):
             if not held:
                 names.append(f"{level}_{len(names) - first}/meta.json")
             leaf, before = used[index.start], sum(map(len, held))
@@ -227,7 +230,7 @@ def _described(part: _Tree, levels: Sequence[Splats]) -> dict[str, Any]:
 
 def _box(splats: Splats, rows: _Rows) -> tuple[list[float], list[float]]:
     lows, highs = [], []
-    for part in reported_blocks(len(rows)):
+    for part in blocks(len(rows)):
         some = rows[part]
         sizes = np.exp(splats.log_scales[some].astype(np.float64))
         reach = (np.abs(matrices_of(splats.quaternions[some])) * sizes[:, None, :]).sum(axis=2)

@@ -1,16 +1,14 @@
 """The table of splat formats: one row for each format, and what follows from the rows.
 
-This table lists what `stages.formats` itself reads and writes. How a file is checked by a parser
-that did not write it is listed in `stages.proof.checks`; the formats of meshes are listed in
-`stages.formats.mesh_files`. Both know their formats by the same endings.
+Reading it imports nothing, because settings and help are made from it. The functions of each format
+are in `stages.formats.codecs`, its checks in `stages.proof.checks`, by the same endings.
 """
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from pkgutil import resolve_name
 
 from stages.base.errors import UsageError
 
@@ -19,25 +17,10 @@ AUTO, PLAIN, ANTIALIASED = DRAWINGS = "auto", "plain", "antialiased"
 
 @dataclass(frozen=True)
 class Format:
-    """One splat format. Functions are named as "module:function" and are imported at their first
-    use, so that reading the table imports nothing.
+    """One splat format.
 
     Attributes:
         ending: what a file's name ends in, without the dot; also the value of `--format`.
-        opens_in, keeps: two cells of README's table.
-        writer: (path, splats, *, units), with drawable splats. It also takes `views` if
-            `takes_views`, and `coarser` if `streamed`.
-        reader: (path) -> Splats, y down; raises BadFileError, or what damaged bytes cause.
-        units: (path) -> the units that a file declares, or ""; raises as `reader`. "" for formats
-            whose files declare them in text at their start, or not at all.
-        order: (splats) -> [N] the row of `splats` that each row of the file comes from; "" if the
-            format keeps the order.
-        quantiser: (splats, bit depths) -> Splats on coarser grids, for a format that compresses
-            repeated values; "" for the others.
-        position_loss: (splats) -> what far splats do to the positions, as the end of "the file
-            ...", or ""; "" for formats in which they do nothing.
-        size_loss: (splats) -> what happens to splats that are too small, as the end of "the file
-            ...", or ""; "" for formats that hold all sizes.
         loses: what of the splats changes, as the end of "the format ..."; "" if every value comes
             back as float32.
         sh_degree: the highest SH degree that is kept.
@@ -45,9 +28,9 @@ class Format:
         holds_origin: whether a file holds the origin of a georeferenced scene; else it is written
             beside, see `stages.formats.offset`.
         sidecar: the suffix of a file beside it that belongs to it; "" if there is none.
-        parts: (path) -> the files that the file at `path` names, by relative name; "" if it names
-            none.
         takes_views: whether the file also holds cameras.
+        has_bit_depths: whether splats are rounded to chosen bit depths before they are written,
+            because the format compresses repeated values.
         needs_finetuning: whether rounding is so coarse that splats are fine-tuned to it.
         drawn_antialiased: whether programs that the format is for draw it with opacity
             compensation.
@@ -57,22 +40,13 @@ class Format:
     """
 
     ending: str
-    opens_in: str
-    keeps: str
-    writer: str
-    reader: str
-    units: str = ""
-    order: str = ""
-    quantiser: str = ""
-    position_loss: str = ""
-    size_loss: str = ""
     loses: str = ""
     sh_degree: int = 3
     y_up: bool = False
     holds_origin: bool = True
     sidecar: str = ""
-    parts: str = ""
     takes_views: bool = False
+    has_bit_depths: bool = False
     needs_finetuning: bool = False
     drawn_antialiased: bool = False
     says_drawing: bool = True
@@ -96,8 +70,10 @@ class Format:
         if the asset has parts and does not name them."""
         page = path.with_suffix(self.sidecar) if self.sidecar else path
         beside = [path, page] if page != path and page.is_file() else [path]
-        if self.parts:
-            chunks = set(resolve_name(self.parts)(path).values()) - set(beside)
+        if self.streamed:
+            from stages.formats import streamed_sog  # it loads NumPy, which the table does without
+
+            chunks = set(streamed_sog.parts_of(path).values()) - set(beside)
             return [*beside, *sorted(chunks)]
         return beside
 
@@ -108,75 +84,29 @@ class Format:
 
 _MESH = re.compile(r"\.mesh\.(glb|ply)$")  # of the names of meshes
 
-_GLB = Format(
-    "glb",
-    opens_in="viewers with KHR_gaussian_splatting; others show points",
-    keeps="everything",
-    writer="stages.formats.gltf:write",
-    reader="stages.formats.gltf_read:read",
-    y_up=True,
-)
-_USD = Format(
-    "usda",
-    opens_in="USD tools with particle fields (OpenUSD 26.03 or newer)",
-    keeps="everything",
-    writer="stages.formats.usd:write",
-    reader="stages.formats.usd_read:read",
-    y_up=True,
-)
 TABLE = (
-    Format(
-        "ply",
-        opens_in="nearly every program that reads splats",
-        keeps="everything, float32",
-        writer="stages.formats.ply:write",
-        reader="stages.formats.ply:read",
-    ),
+    Format("ply"),
     Format(
         "splat",
-        opens_in="web viewers",
-        keeps="8-bit colour and rotation; one colour, averaged over the views",
-        writer="stages.formats.splat32:write",
-        reader="stages.formats.splat32:read",
-        order="stages.formats.splat32:order",
         loses="has 8-bit colours that do not change with the view",
         sh_degree=0,
         needs_finetuning=True,
         says_drawing=False,
         holds_origin=False,
     ),
-    _GLB,
-    replace(_GLB, ending="gltf", sidecar=".bin"),
-    _USD,
-    replace(_USD, ending="usdc", units="stages.formats.usd_read:units"),
-    replace(_USD, ending="usdz", units="stages.formats.usd_read:units"),
-    replace(
-        _GLB,
-        ending="quantised.glb",
-        opens_in="as `glb`; three.js blends splats of each degree of view dependence by themselves",
-        keeps="sizes, rotations and opacities in 16 bits",
-        writer="stages.formats.gltf_quantised:write",
-        order="stages.formats.gltf_quantised:order",
-        loses="has rotations, sizes and opacities of 16 bits",
-    ),
+    Format("glb", y_up=True),
+    Format("gltf", y_up=True, sidecar=".bin"),
+    Format("usda", y_up=True),
+    Format("usdc", y_up=True),
+    Format("usdz", y_up=True),
+    Format("quantised.glb", loses="has rotations, sizes and opacities of 16 bits", y_up=True),
     Format(
         "compressed.ply",
-        opens_in="PlayCanvas, SuperSplat, Spark",
-        keeps="positions and sizes to 1/1000 of those of 256 neighbours, 8-bit colour",
-        writer="stages.formats.compressed_ply:write",
-        reader="stages.formats.compressed_ply:read",
-        order="stages.formats.compressed_ply:order",
         loses="has positions and sizes of 10 and 11 bits, and 8-bit colours",
         needs_finetuning=True,
     ),
     Format(
         "spz",
-        opens_in="Spark, Open3D, three.js",
-        keeps="sizes to 3 %, 8-bit colour, 4 to 5 bits of view-dependent colour",
-        writer="stages.formats.spz:write",
-        reader="stages.formats.spz_read:read",
-        position_loss="stages.formats.spz:position_loss",
-        size_loss="stages.formats.spz:size_loss",
         holds_origin=False,
         loses="has sizes in steps of 6 %, 8-bit colours and view-dependent colour of 4 and 5 bits",
         needs_finetuning=True,
@@ -185,39 +115,18 @@ TABLE = (
     ),
     Format(
         "sog",
-        opens_in="PlayCanvas, SuperSplat, Spark",
-        keeps="16-bit positions, 256 sizes and colours, a palette of view-dependent colours",
-        writer="stages.formats.sog:write",
-        reader="stages.formats.sog_read:read",
-        units="stages.formats.sog_read:units",
-        order="stages.scene.morton:morton_order",
-        quantiser="stages.formats.sog_quantisation:quantise_for_sog",
-        position_loss="stages.formats.sog:position_loss",
+        has_bit_depths=True,
         loses="has 256 sizes and colours, and a palette of view-dependent colours",
         needs_finetuning=True,
     ),
     Format(
         "lod-meta.json",
-        opens_in="PlayCanvas, SuperSplat, which load nearby chunks first",
-        keeps="as `sog`, in chunks and levels of detail; written by `splat edit`",
-        writer="stages.formats.streamed_sog:write",
-        reader="stages.formats.streamed_sog:read",
-        order="stages.formats.streamed_sog:order",
         loses="has 256 sizes and colours, and a palette of view-dependent colours",
         sidecar=".html",
-        parts="stages.formats.streamed_sog:parts_of",
         takes_views=True,
         streamed=True,
     ),
-    Format(
-        "html",
-        opens_in="any browser, from disk, without a network",
-        keeps="everything; also the viewer and the cameras",
-        writer="stages.formats.html:write",
-        reader="stages.formats.html:read",
-        takes_views=True,
-        drawn_antialiased=True,
-    ),
+    Format("html", takes_views=True, drawn_antialiased=True),
 )
 BY_ENDING = {row.ending: row for row in TABLE}
 FORMATS = {row.ending: row for row in TABLE if not row.streamed}  # one file each

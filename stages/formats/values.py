@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from stages.base import scratch
 from stages.base.bad_files import BadFileError
-from stages.base.blocks import blocks, reported_blocks
+from stages.base.blocks import blocks
 from stages.raster.definition import LOG_SCALE_MAX, QUATERNION_MIN
 from stages.scene import ROW_FIELDS, Splats
 
@@ -73,7 +73,7 @@ def select_rows(splats: Splats, keep: NDArray[np.bool_]) -> Splats:
         return splats
     arrays = empty_rows(splats, int(keep.sum()))
     start = 0
-    for rows in reported_blocks(len(splats)):
+    for rows in blocks(len(splats)):
         mask = keep[rows]
         there = slice(start, start + int(mask.sum()))
         for name, values in arrays.items():
@@ -200,7 +200,7 @@ def concatenate(parts: Sequence[Splats]) -> Splats:
     arrays = empty_rows(max(parts, key=lambda part: part.sh_degree), sum(map(len, parts)))
     start = 0
     for part in parts:
-        for rows in reported_blocks(len(part)):
+        for rows in blocks(len(part)):
             for name, every in arrays.items():
                 values = getattr(part, name)[rows]
                 out = every[start + rows.start : start + rows.stop]

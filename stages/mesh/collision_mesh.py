@@ -1,7 +1,4 @@
-"""Splats and their cameras -> the collision mesh and its quality figures.
-
-Also: vertex colours of the mesh from the drawn views.
-"""
+"""Splats and their cameras -> the collision mesh and its quality figures."""
 
 from __future__ import annotations
 
@@ -9,14 +6,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from stages.base.errors import Interrupted
 from stages.base.stage import Report
 from stages.mesh import depth_maps, extract, fuse
 from stages.mesh.depth_maps import DepthMap
 from stages.mesh.distance import distances_to_mesh
+from stages.mesh.vertex_colours import colour_vertices
 from stages.raster.draw import raster_settings_of
 from stages.scene import Reconstruction, Splats, split_held_out
 from stages.scene.mesh import Mesh
@@ -33,9 +29,6 @@ class CollisionMesh:
     triangles, vertices, watertight, voxel, removed_components.
     covered_share: of the pixels with depth in the training cameras, the share whose surface (median
     depth) lies within two voxels of the mesh. Surfaces outside the fused box are not covered.
-    sparse_points_inside_share: the share of sparse points inside the fused box. For these:
-    sparse_median_distance, sparse_p90_distance to the nearest triangle, and both relative to the
-    diagonal of the box; None where there are no such points.
     """
 
     mesh: Mesh
@@ -83,10 +76,9 @@ def make_collision_mesh(
         "triangles": len(mesh.faces),
         "vertices": len(mesh.vertices),
         "watertight": mesh.is_watertight,
-        "voxel": _rounded(volume.voxel),
+        "voxel": float(f"{volume.voxel:.4g}"),
         "removed_components": removed,
         "covered_share": covered,
-        **_sparse_point_figures(mesh, reconstruction.points, volume),
     }
     _warn_of_gaps(covered, report)
     return CollisionMesh(mesh, figures)
@@ -118,52 +110,3 @@ def _covered(mesh: Mesh, maps: list[DepthMap], voxel: float) -> float:
     places = np.concatenate([found.points(step) for found in solid])
     near = distances_to_mesh(places, mesh, voxel) <= _COVERED_VOXELS * voxel
     return round(float(near.mean()), 4)
-
-
-def _sparse_point_figures(
-    mesh: Mesh, points: NDArray[np.float64], volume: fuse.Volume
-) -> dict[str, float | None]:
-    inside = np.all((points >= volume.corner) & (points <= volume.far_corner), axis=1)
-    share = float(inside.mean()) if len(points) else 0.0
-    figures: dict[str, float | None] = {"sparse_points_inside_share": round(share, 4)}
-    found = distances_to_mesh(points[inside], mesh, volume.voxel)
-    diagonal = float(np.linalg.norm(volume.far_corner - volume.corner))
-    for name, percent in (("median", 50), ("p90", 90)):
-        value = float(np.percentile(found, percent)) if len(found) else None
-        figures[f"sparse_{name}_distance"] = _rounded(value)
-        figures[f"sparse_{name}_distance_share"] = _rounded(value and value / diagonal)
-    return figures
-
-
-def _rounded(value: float | None) -> float | None:
-    return None if value is None else float(f"{value:.4g}")
-
-
-def colour_vertices(mesh: Mesh, maps: list[DepthMap], tolerance: float) -> Mesh:
-    """The mesh with colours: the weighted mean of the pixels that see each vertex.
-
-    tolerance: the largest distance in depth between a pixel and a vertex that it sees, world units.
-    A vertex that no pixel sees takes the colour of the nearest one that is seen.
-    """
-    if not len(mesh.vertices):
-        return mesh
-    sums, weights = np.zeros((len(mesh.vertices), 3)), np.zeros(len(mesh.vertices))
-    for found in maps:
-        camera = found.camera
-        pixels, z = camera.project(mesh.vertices.astype(np.float64))
-        inside = (z > 0) & camera.shows(pixels)
-        columns, rows = pixels[inside].astype(int).T
-        agrees = np.abs(found.depth[rows, columns] - z[inside]) < tolerance
-        seen = np.flatnonzero(inside)[agrees]
-        rows, columns = rows[agrees], columns[agrees]
-        weight = found.weight[rows, columns].astype(np.float64)
-        sums[seen] += weight[:, None] * found.colour[rows, columns]
-        weights[seen] += weight
-    known = weights > 0
-    if not known.any():
-        return mesh
-    colours = np.zeros((len(weights), 3))
-    colours[known] = sums[known] / weights[known, None]
-    _, nearest = cKDTree(mesh.vertices[known]).query(mesh.vertices[~known])
-    colours[~known] = colours[known][nearest]
-    return replace(mesh, colours=np.rint(colours).astype(np.uint8))

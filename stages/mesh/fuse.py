@@ -39,11 +39,6 @@ class Volume:
     corner: NDArray[np.float64]
     voxel: float
 
-    @property
-    def far_corner(self) -> NDArray[np.float64]:
-        """[3] centre of the last voxel."""
-        return self.corner + self.voxel * (np.array(self.distance.shape) - 1)
-
 
 def voxel_budget() -> int:
     """The number of voxels: VOXELS, or as many as a quarter of the free memory holds."""

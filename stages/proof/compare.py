@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pkgutil import resolve_name
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.formats import BY_ENDING, Format
+from stages.formats import BY_ENDING
+from stages.formats.codecs import CODECS
 from stages.proof.content import FileContent, arrays_by_rows
 from stages.proof.matching import Rows, extent_of, matched_rows
 from stages.scene import SH_C0, Splats
@@ -28,11 +28,16 @@ _VISIBLE = {
 }
 _ROUNDING = 0.01  # share of a visible error below which a difference is rounding
 # Medians above these show a mistake, as no format loses so much: share of the extent, natural
-# logarithm, 0..1, degrees, 0..1.
-_WRONG = {"position": 0.01, "log_scale": 0.5, "opacity": 0.1, "rotation": 10.0, "colour": 0.1}
-# Squared error of SH coefficients above degree 0, relative to their squares: 1 where they are
-# missing, about 2 where they are unrelated.
-_WRONG_SH = 1.1
+# logarithm, 0..1, degrees, 0..1; for SH coefficients above degree 0 the squared error relative to
+# their squares: 1 where they are missing, about 2 where they are unrelated.
+_WRONG = {
+    "position": 0.01,
+    "log_scale": 0.5,
+    "opacity": 0.1,
+    "rotation": 10.0,
+    "colour": 0.1,
+    "sh": 1.1,
+}
 # Natural logarithm of the thinnest axis that looks unlike a flat splat, relative to the longest
 # one: it is a pixel wide where the splat covers about 150 pixels. Formats differ in how thin an
 # axis they hold, and flat splats have no thickness at all.
@@ -50,7 +55,9 @@ class Differences:
             stored.
         worst: the attribute with the most visible largest difference; "" if all are rounding.
         worst_row: its row in the file.
-        wrong: attributes that are wrong for most splats.
+        wrong: by attribute that is wrong for most splats, its median error: positions as a share of
+            the scene's extent, the others in the units of `largest`. Positions come alone, because
+            without them rows cannot be matched. "sh": the squared error, relative to the squares.
         rows: [N] for each row of the file the row of the original.
         median_position_error: in world units.
     """
@@ -58,7 +65,7 @@ class Differences:
     largest: dict[str, float]
     worst: str
     worst_row: int
-    wrong: tuple[str, ...]
+    wrong: dict[str, float]
     rows: Rows
     median_position_error: float = 0.0
 
@@ -68,14 +75,13 @@ def differences(splats: Splats, content: FileContent, *names: str) -> Difference
 
     names: the formats that either went through; some sort the rows or reduce the SH degree.
     """
-    formats = [BY_ENDING[name] for name in names]
     file = content.splats
     upright = content.world_from_file[1, 1] < 0
     placed = splats
     if upright:
         placed = replace(splats, means=splats.means * FLIP.astype(splats.means.dtype))
-    rows = matched_rows(placed, file, _orders(placed, file, formats))
-    kept = [row.sh_degree for row in formats]
+    rows = matched_rows(placed, file, _orders(placed, file, names))
+    kept = [BY_ENDING[name].sh_degree for name in names]
     degree = min([max(splats.sh_degree, file.sh_degree), *kept])
     sums = np.zeros(3)
 
@@ -90,12 +96,11 @@ def differences(splats: Splats, content: FileContent, *names: str) -> Difference
     return _summary(arrays_by_rows(len(file), errors_of, _BLOCK), sums, extent_of(splats), rows)
 
 
-def _orders(truth: Splats, file: Splats, formats: list[Format]) -> Iterator[Rows]:
+def _orders(truth: Splats, file: Splats, names: tuple[str, ...]) -> Iterator[Rows]:
     """The orders in which the formats may have written either side; an iterator, because the first
     often fits."""
-    for row in formats:
-        if row.order:
-            order = resolve_name(row.order)
+    for name in names:
+        if order := CODECS[name].order:
             yield order(truth)
             yield np.argsort(order(file))
 
@@ -139,25 +144,26 @@ def _summary(
     errors: dict[str, NDArray[np.floating]], sums: NDArray[np.float64], extent: float, rows: Rows
 ) -> Differences:
     if not len(rows):
-        return Differences(_named(dict.fromkeys(_VISIBLE, 0.0)), "", 0, (), rows)
+        return Differences(_named(dict.fromkeys(_VISIBLE, 0.0)), "", 0, {}, rows)
     largest = {name: float(errors[name].max()) for name in _VISIBLE}
     units = {**_VISIBLE, "position": _VISIBLE["position"] * extent}
     worst = max(_VISIBLE, key=lambda name: largest[name] / units[name])
     shows = largest[worst] > _ROUNDING * units[worst]
     row = int(errors[worst].argmax()) if shows else 0
-    typical = {name: float(np.median(errors[name])) for name in _WRONG}
+    typical = {name: float(np.median(errors[name])) for name in _WRONG if name != "sh"}
     median_position_error = typical["position"]
     typical["position"] /= extent
     long = errors["anisotropy"] > _ANISOTROPIC
     typical["rotation"] = float(np.median(errors["rotation"][long])) if long.any() else 0.0
-    wrong = [name for name in _WRONG if typical[name] > _WRONG[name]]
-    if sums[0] > _WRONG_SH * max(sums[1], sums[2]):
-        wrong.append("sh")
+    typical["sh"] = float(sums[0] / max(sums[1], sums[2], 1e-30))
+    wrong = {name: error for name, error in typical.items() if error > _WRONG[name]}
+    if "position" in wrong:
+        wrong = {"position": wrong["position"]}
     return Differences(
         _named(largest),
         worst if shows else "",
         row,
-        tuple(wrong),
+        wrong,
         rows,
         median_position_error,
     )

@@ -4,8 +4,6 @@ None of them shares code with its writer: plyfile, pygltflib with raw accessors,
 usd-core, the bytes of .splat, and the standard library's HTML parser for .html. They leave the
 splats in the axes of the file. The check moves the camera into these axes instead of turning the
 splats, so that a wrong rotation of positions, quaternions or SH shows in the picture.
-
-Also: the validators that come with the USD library.
 """
 
 from __future__ import annotations
@@ -264,23 +262,3 @@ def _usd(name: str) -> Splats:
     note = stage.GetRootLayer().customLayerData.get("splat")
     antialias = isinstance(note, dict) and note.get("antialiased", False)
     return concatenate(parts).with_antialias(antialias)
-
-
-def usd_errors(path: Path) -> list[str]:
-    """One line for each error that a registered validator finds.
-
-    The validators check stages, packages and prims, but not particle fields: the independent
-    readers check the values. Warnings and remarks are ignored.
-    """
-    from pxr import Usd, UsdValidation
-
-    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
-    with accepted_path(path) as name:
-        stage = Usd.Stage.Open(name)
-        stage.Reload()  # the library's cache may hold an older file of the same name
-        found = UsdValidation.ValidationContext(validators).Validate(stage)
-    return [
-        " ".join(error.GetErrorAsString().split())
-        for error in found
-        if error.GetType() == UsdValidation.ValidationErrorType.Error
-    ]

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from stages.base import scratch
-from stages.base.blocks import blocks, reported_blocks
+from stages.base.blocks import blocks
 from stages.scene import Splats, dc_to_rgb
 from stages.scene.quantiles import quantiles
 
@@ -27,6 +28,14 @@ _DISTANCE_WEIGHT = 20.0
 _NEIGHBOURS = 8
 _ROUNDS = 8
 _KDTREE_SINGLE = 4  # OpenCV's name for the exact tree for few dimensions
+
+
+@dataclass(frozen=True)
+class _Side:
+    """means: [N, 3]. values: [N, 7], see `_values`."""
+
+    means: NDArray[np.floating]
+    values: NDArray[np.float32]
 
 
 def extent_of(splats: Splats) -> float:
@@ -52,15 +61,15 @@ def matched_rows(truth: Splats, file: Splats, orders: Iterable[Rows]) -> Rows:
         orders: orders in which the file may have been written; the unchanged order is tried first.
     """
     n, extent = len(truth), extent_of(truth)
-    values = _values(truth), _values(file)
+    here, there = (_Side(splats.means, _values(splats)) for splats in (truth, file))
     every = np.arange(n)
     found, fewest = (every, every, np.zeros(n, bool)), n + 1
     for index in (np.arange(n), *orders) if n else ():
         distance, unlike = np.empty(n, np.float32), np.empty(n, bool)
-        for rows in reported_blocks(n):
+        for rows in blocks(n):
             moved = np.abs(truth.means[index[rows]] - file.means[rows])
             distance[rows] = moved.max(axis=1, initial=0.0)
-            unlike[rows] = _unlike(values[0][index[rows]], values[1][rows])
+            unlike[rows] = _unlike(here.values[index[rows]], there.values[rows])
         far = distance > _APART * extent
         mismatched, most = far | unlike, _MAX_MISMATCHED * n
         count = int(np.count_nonzero(mismatched))
@@ -71,7 +80,7 @@ def matched_rows(truth: Splats, file: Splats, orders: Iterable[Rows]) -> Rows:
             found, fewest = (index, np.flatnonzero(mismatched), far[mismatched]), count
         if fewest <= most:
             break
-    _match_neighbours(truth, file, *found, _APART * extent / _DISTANCE_WEIGHT, *values)
+    _match_neighbours(here, there, *found, _APART * extent / _DISTANCE_WEIGHT)
     return found[0]
 
 
@@ -96,14 +105,7 @@ def _unlike(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.bool_]
 
 
 def _match_neighbours(
-    truth: Splats,
-    file: Splats,
-    index: Rows,
-    mismatched: Rows,
-    moved: NDArray[np.bool_],
-    unit: float,
-    truths: NDArray[np.float32],
-    files: NDArray[np.float32],
+    truth: _Side, file: _Side, index: Rows, mismatched: Rows, moved: NDArray[np.bool_], unit: float
 ) -> None:
     """Match the rows `mismatched` among themselves, changing `index` in place.
 
@@ -124,10 +126,10 @@ def _match_neighbours(
         queries = np.ascontiguousarray(file.means[mine], np.float32)
         places, squares = tree.knnSearch(queries, count, params={"checks": -1})
         choice = np.arange(len(mine))
-        unlike = np.square(truths[theirs] - files[mine]).sum(axis=1)
+        unlike = np.square(truth.values[theirs] - file.values[mine]).sum(axis=1)
         cost = np.where(moved, unlike + 1, np.inf)
         for place, square in zip(places.T, squares.T, strict=True):
-            unlike = np.square(truths[theirs[place]] - files[mine]).sum(axis=1)
+            unlike = np.square(truth.values[theirs[place]] - file.values[mine]).sum(axis=1)
             total = square.astype(np.float64) / unit**2 + unlike
             better = total < cost
             cost[better], choice[better] = total[better], place[better]

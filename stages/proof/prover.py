@@ -3,8 +3,6 @@
 An independent reader reads it back, the rasteriser draws it from held-out cameras, and every value
 is compared with the original. Of more than `_MAX_DRAWN` splats only the central ones are drawn,
 because drawing takes more memory than the splats themselves.
-
-Also: why a file of a lossy format differs from its original: the cause, for a warning.
 """
 
 from __future__ import annotations
@@ -12,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from pkgutil import resolve_name
 from typing import Any
 
 import numpy as np
@@ -20,13 +17,13 @@ from numpy.typing import NDArray
 
 from stages.base.blocks import blocks
 from stages.base.errors import QualityError
-from stages.base.text import counted, reason_of
+from stages.base.text import reason_of
 from stages.evaluate.image_metrics import IDENTICAL_DB, capped_psnr_db
-from stages.formats import BY_ENDING, Format, format_of
-from stages.formats.compressed_ply import outlier_shells
+from stages.formats import BY_ENDING, format_of
+from stages.formats.codecs import CODECS
 from stages.formats.losses import ENLARGE
 from stages.formats.values import check_finite, drop_undrawable, nonfinite_allowed
-from stages.proof import checks, diagnosis
+from stages.proof import checks
 from stages.proof.compare import differences
 from stages.proof.content import FileContent, NotCrossCheckedError
 from stages.proof.matching import Rows
@@ -34,7 +31,6 @@ from stages.raster.backends import AUTO
 from stages.raster.draw import raster_settings_of, renderer
 from stages.scene import Camera, QuantisedSplats, Splats, View, evenly_spaced, split_held_out
 from stages.scene.framing import orbit_cameras
-from stages.scene.quantiles import median_spacing
 
 _SIDE_PX = 480
 _CAMERAS = 3
@@ -42,6 +38,14 @@ _CENTRAL_SHARE = 0.5  # of the splats, to look at where no views are known
 _MAX_DRAWN = 1 << 22
 _MIN_LOSSLESS_DB = 45.0  # a file of a lossless format below this is wrong
 _WARN_LOSSY_DB = 30.0  # a file of a lossy format below this gets a warning
+_WRONG = {
+    "position": "most positions are wrong, by {:.2g} of the scene's extent",
+    "log_scale": "most sizes are wrong, by a factor of e^{:.2g}",
+    "opacity": "most opacities are wrong, by {:.2g}",
+    "rotation": "most rotations are wrong, by {:.2g} degrees",
+    "colour": "most colours are wrong, by {:.2g}",
+    "sh": "most view-dependent colours are wrong, by {:.0%} of their squares",
+}
 
 
 @dataclass(frozen=True)
@@ -123,7 +127,7 @@ class Prover:
                 given=f"{path} came out wrong: {proof.fault}.",
                 wanted="A file that another program reads as the same splats.",
                 hint=f"{ENLARGE}."
-                if _size_loss(format_of(path), self.splats)
+                if CODECS[format_of(path).ending].size_loss(self.splats)
                 else "Write another format, and report this with the file that was read.",
             )
         return proof
@@ -180,8 +184,8 @@ class Prover:
             "worst_attribute": found.worst,
             "worst_splat": found.worst_row,
         }
-        fault = diagnosis.explain(self.splats, content, found)
-        if "log_scale" in found.wrong and (loss := _size_loss(BY_ENDING[names[0]], self.splats)):
+        fault = " and ".join(_WRONG[name].format(error) for name, error in found.wrong.items())
+        if "log_scale" in found.wrong and (loss := CODECS[names[0]].size_loss(self.splats)):
             fault = f"{fault} (the format {loss})"
         if not lossy and worst < _MIN_LOSSLESS_DB:
             drawn = f"drawn again it differs by {worst:.1f} dB"
@@ -238,38 +242,3 @@ def _drawable(content: FileContent) -> FileContent:
     readers."""
     with nonfinite_allowed():
         return replace(content, splats=drop_undrawable(check_finite(content.splats))[0])
-
-
-def _size_loss(row: Format, splats: Splats) -> str:
-    return resolve_name(row.size_loss)(splats) if row.size_loss else ""
-
-
-_DROP = "`splat edit --drop-floaters` removes outliers"
-
-
-def losses_shown(row: Format, proof: Proof, splats: Splats) -> str:
-    """What was lost in a file of the format `row` made from `splats`, and why; "" where the
-    pictures agree and half of the positions are right to the distance between neighbours."""
-    spacing = median_spacing(splats.means)
-    shifted = proof.median_position_error > spacing > 0
-    if proof.loss_db is None and not shifted:
-        return ""
-    found = []
-    if proof.loss_db is not None:
-        found.append(f"its pictures have a PSNR of {proof.loss_db:.1f} dB")
-    if shifted:
-        ratio = proof.median_position_error / spacing
-        found.append(f"half of the splats are off by {ratio:.1f} distances between neighbours")
-    moved = shifted or proof.figures["max_position_error"] > spacing > 0
-    return f"{' and '.join(found)}: {_cause(row, splats, moved)}"
-
-
-def _cause(row: Format, splats: Splats, moved: bool) -> str:
-    """moved: whether positions differ by more than the distance between neighbours."""
-    if moved and row.position_loss and (loss := resolve_name(row.position_loss)(splats)):
-        return f"it {loss}. {_DROP}."
-    if moved and (count := int(np.count_nonzero(outlier_shells(splats.means)))):
-        return f"{counted(count, 'outlier')} widened the range of its positions. {_DROP}."
-    if moved:
-        return "its positions have too few bits for splats so close together."
-    return f"the format {row.loses}." if row.loses else "the original had lost more already."

@@ -4,21 +4,15 @@ Troublesome splats:
 - needle: the longest axis is more than 100 times the second. Its effective rank (Hyung et al. 2024,
   "Effective Rank Analysis and Regularization for Enhanced 3D Gaussian Splatting") is then 1.001 of
   3: a line, which becomes visible from new views. A flat splat is no needle.
-- giant: the longest standard deviation is more than a tenth of the scene's extent, beyond which the
-  reference trainer removes a splat (Kerbl et al. 2023).
 - outlier: the centre lies more than 5 times as far out as the box that holds the middle 98 % of the
   coordinates on each axis. A viewer that frames everything then shows the scene as a dot.
 - transparent: the opacity is below 1/255, so that it is never drawn.
 - no rotation: the quaternion is 0 or too short to be normalised; too large: the squared scale
   exceeds float32. Neither can be drawn.
-- duplicate: equal to another splat in everything but SH above degree 0.
-
-Also: parameters and memory of a splat, in figures that can be checked by hand.
 """
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from dataclasses import dataclass
 
@@ -27,11 +21,10 @@ from numpy.typing import NDArray
 
 from stages.base.blocks import blocks
 from stages.raster.definition import ALPHA_MIN, LOG_SCALE_MAX, QUATERNION_MIN
-from stages.scene import ROW_FIELDS, Splats, parameters_per_splat
+from stages.scene import ROW_FIELDS, Splats
 from stages.scene.quantiles import quantiles
 
 NEEDLE_ASPECT = 100.0
-GIANT_PART = 0.1  # of the extent
 OUTLIER_BOXES = 5.0
 _BOX = {"low": 0.0, "middle_low": 0.01, "median_centre": 0.5, "middle_high": 0.99, "high": 1.0}
 _VALUES = ROW_FIELDS[:-1]
@@ -49,7 +42,6 @@ class Statistics:
         low, high: [3] box of the centres.
         middle_low, middle_high: [3] box of the central 98 % of the coordinates on each axis.
         median_centre: [3] median coordinates.
-        extent: diagonal of the middle box.
         median_scale: median standard deviation.
         median_opacity: in 0..1.
         troubles: the number of splats of each kind of trouble, see above.
@@ -64,7 +56,6 @@ class Statistics:
     middle_low: NDArray[np.float64]
     middle_high: NDArray[np.float64]
     median_centre: NDArray[np.float64]
-    extent: float
     median_scale: float
     median_opacity: float
     troubles: dict[str, int]
@@ -76,23 +67,16 @@ def statistics_of(splats: Splats) -> Statistics:
     by_degree = {int(d): int(n) for d, n in zip(degrees, counts, strict=True)}
     whole, not_finite = _finite(splats)
     box = dict(zip(_BOX, quantiles(splats.means[whole], tuple(_BOX.values())), strict=True))
-    extent = float(np.linalg.norm(box["middle_high"] - box["middle_low"]))
     troubles: Counter[str] = Counter()
-    keys = np.empty(len(splats), np.uint64)
     for rows in blocks(len(splats)):
-        block = splats.take(rows)
-        keys[rows] = _fingerprints(block)
-        for name, marks in _troubles(block.take(whole[rows]), box, extent).items():
+        for name, marks in _troubles(splats.take(rows).take(whole[rows]), box).items():
             troubles[name] += int(np.count_nonzero(marks))
-    keys = keys[whole]
-    troubles["duplicates"] = len(keys) - len(np.unique(keys))
     return Statistics(
         count=len(splats),
         by_degree=by_degree,
         not_finite=not_finite,
-        whole=len(keys),
+        whole=int(np.count_nonzero(whole)),
         **box,
-        extent=extent,
         median_scale=float(np.exp(_median(splats.log_scales[whole]))),
         median_opacity=1 / (1 + float(np.exp(-_median(splats.opacity_logits[whole])))),
         troubles=dict(troubles),
@@ -112,9 +96,7 @@ def _finite(splats: Splats) -> tuple[NDArray[np.bool_], dict[str, int]]:
     return whole, {name: n for name, n in failed.items() if n}
 
 
-def _troubles(
-    splats: Splats, box: dict[str, NDArray[np.float64]], extent: float
-) -> dict[str, NDArray[np.bool_]]:
+def _troubles(splats: Splats, box: dict[str, NDArray[np.float64]]) -> dict[str, NDArray[np.bool_]]:
     """By kind of trouble: [N] which splats have it. All values must be finite."""
     logs = np.sort(splats.log_scales, axis=1)
     middle = (box["middle_low"] + box["middle_high"]) / 2
@@ -122,7 +104,6 @@ def _troubles(
     with np.errstate(over="ignore", divide="ignore"):
         return {
             "needles": logs[:, 2] - logs[:, 1] > np.log(NEEDLE_ASPECT),
-            "giants": logs[:, 2] > np.log(GIANT_PART * extent or np.inf),
             "outliers": (np.abs(splats.means - middle) > OUTLIER_BOXES * half).any(axis=1),
             "transparent": splats.opacities < ALPHA_MIN,
             "no-rotation": np.abs(splats.quaternions).max(axis=1, initial=0.0) < QUATERNION_MIN,
@@ -130,48 +111,5 @@ def _troubles(
         }
 
 
-def _fingerprints(splats: Splats) -> NDArray[np.uint64]:
-    """[N] a 64-bit hash of each row; two different rows of 10 million collide with a probability of
-    3 in a million."""
-    columns = (splats.means, splats.quaternions, splats.log_scales, splats.sh[:, 0])
-    table = np.concatenate([*columns, splats.opacity_logits[:, None]], axis=1, dtype=np.float32)
-    words = np.ascontiguousarray(table).view(np.uint32).astype(np.uint64)
-    key = np.zeros(len(words), np.uint64)
-    for column in words.T:  # the prime of FNV-1a, and a shift that mixes in the high bits
-        key = (key ^ column) * np.uint64(0x100000001B3)
-        key ^= key >> np.uint64(29)
-        key *= np.uint64(0xBF58476D1CE4E5B9)
-    return key
-
-
 def _median(values: NDArray[np.floating]) -> np.float64:
     return np.float64(np.median(values)) if values.size else np.float64(np.nan)
-
-
-SINGLE_BYTES, HALF_BYTES = 4, 2
-# In training, each parameter has a gradient and two moments of Adam.
-TRAINED_COPIES = 4
-DEGREES = (0, 1, 2, 3)
-
-
-def floats_of(degree: int) -> int:
-    """Parameters of one splat: position 3, rotation 4, scale 3, opacity 1, and 3 colours for each
-    of (degree + 1)^2 spherical harmonics."""
-    return int(parameters_per_splat(np.array(degree)))
-
-
-def memory_of(degree: int, count: int = 1) -> dict[str, int]:
-    """Bytes of `count` splats of one SH degree, by precision."""
-    numbers = floats_of(degree) * count
-    single = SINGLE_BYTES * numbers
-    return {
-        "float32": single,
-        "half precision": HALF_BYTES * numbers,
-        "in training": TRAINED_COPIES * single,
-    }
-
-
-def mass_within(sigmas: float) -> float:
-    """The share of the mass of a two-dimensional Gaussian, as which a splat is drawn, within
-    `sigmas` standard deviations of its centre."""
-    return 1.0 - math.exp(-0.5 * sigmas * sigmas)

@@ -129,7 +129,7 @@ def _size_measure(
     `quantise` chooses for all splats: they hardly depend on how many are left."""
     row = FORMATS[settings.mb_of]
     depths: dict[str, int] = {}
-    if settings.max_mb and row.quantiser:
+    if settings.max_mb and row.has_bit_depths:
         views, backend = evenly_spaced(training, DECIDING_VIEWS), backend_of_settings(settings)
         depths, _ = choose_bits(splats, lambda s: mean_psnr_db(s, views, backend), SOG_LOSS_DB)
     return lambda s: file_size_bytes(row, s, depths, reconstruction.units, reconstruction.views)

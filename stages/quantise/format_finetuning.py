@@ -118,7 +118,7 @@ class FormatFinetuning:
         plain = splats_to_write(row, quantised)
         found = splats_to_write(row, replace(quantised, sog_bits=None))
         written = rounded = partial(write_and_read, row)
-        if row.quantiser and quantised.sog_bits is not None:
+        if row.has_bit_depths and quantised.sog_bits is not None:
             found = smallest_rotations(found)
             rounded = partial(quantise_splats, bits=BitDepths(**quantised.sog_bits))
         steps, backend = self.settings.rounding_steps, backend_of_settings(self.settings)

@@ -14,12 +14,12 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from pkgutil import resolve_name
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stages import formats
+from stages.formats.codecs import CODECS
 from stages.formats.table import Format
 from stages.scene import Splats
 from stages.train.finetune import FineTuner
@@ -60,8 +60,8 @@ def write_and_read(row: Format, splats: Splats) -> Splats:
         path = Path(folder) / row.file_name("scene")
         formats.write(path, splats)
         found = formats.read(path).with_sh_degree(splats.sh_degree)
-    if row.order:
-        found = found.take(np.argsort(resolve_name(row.order)(splats)))
+    if order := CODECS[row.ending].order:
+        found = found.take(np.argsort(order(splats)))
     drawn = replace(splats.draw_settings, antialias=found.draw_settings.antialias)
     return replace(found, draw_settings=drawn, origin=splats.origin)
 

@@ -1,14 +1,11 @@
-"""One attempt at one stage: run it in its working folder, measure it, make its output final.
-
-Also: several listeners of a run as one.
-"""
+"""One attempt at one stage: run it in its working folder, measure it, make its output final."""
 
 from __future__ import annotations
 
 import json
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from threading import Event
@@ -18,44 +15,17 @@ from stages.base.errors import Interrupted
 from stages.base.libraries import versions
 from stages.base.memory import PeakMemory
 from stages.base.stage import (
-    DrawView,
-    Numbers,
     Report,
-    Stage,
 )
 from stages.base.text import reason_of
 from stages.run.digests import combined_digest, record_files
 from stages.run.failures import as_splat_error
+from stages.run.listener import Listener
 from stages.run.manifest import Manifest, plain, write_json
 from stages.run.request import Request
 from stages.run.workspace import BOOKKEEPING, USAGE, Workspace
 
 _NOTE_EVERY_S = 5.0
-
-
-class Listener:
-    """Receives the events of a run. Subclasses override the methods that they need."""
-
-    def started(self, stage: Stage, number: int, reason: str, resumed: bool) -> None:
-        """`resumed`: an interrupted attempt at the same request is continued."""
-
-    def progressed(self, stage: Stage, label: str, done: int, total: int, numbers: Numbers) -> None:
-        """As `Report.progress`."""
-
-    def drawable(self, stage: Stage, draw: DrawView) -> None:
-        """As `Report.offer`: the work so far can be drawn."""
-
-    def finished(self, stage: Stage, number: int, manifest: Manifest) -> None:
-        """The stage ran, and its output is final."""
-
-    def skipped(self, stage: Stage, number: int, manifest: Manifest) -> None:
-        """The stage was finished before, and nothing changed."""
-
-    def stopping(self) -> None:
-        """A signal requested a stop; the run stops at the next safe boundary."""
-
-    def ended(self) -> None:
-        """The run is over, whether it succeeded or not."""
 
 
 def attempt(
@@ -160,20 +130,3 @@ class _Usage:
 def _cpu_seconds() -> float:
     """User and system time of this process and of its child processes that have ended."""
     return sum(os.times()[:4])
-
-
-class Listeners(Listener):
-    """Passes each event of a run on to several listeners, in the order given."""
-
-    def __init__(self, *listeners: Listener) -> None:
-        for event in vars(Listener):
-            if not event.startswith("_"):
-                setattr(self, event, _every([getattr(one, event) for one in listeners]))
-
-
-def _every(methods: list[Callable[..., None]]) -> Callable[..., None]:
-    def call(*values: Any) -> None:
-        for method in methods:
-            method(*values)
-
-    return call

@@ -1,10 +1,4 @@
-"""Runs the stages in order, and skips those that are finished and unchanged.
-
-Also: the limit of wall time of a whole command (`--seconds`), divided among its stages.
-
-Stages before training take what time they need; training and pruning end early, and leave time for
-those after them.
-"""
+"""Runs the stages in order, and skips those that are finished and unchanged."""
 
 from __future__ import annotations
 
@@ -21,17 +15,19 @@ from stages.base.interrupt import stop_on_signals
 from stages.base.settings import check_settings
 from stages.base.stage import Stage
 from stages.run import runfolder
-from stages.run.attempt import Listener, attempt
+from stages.run.attempt import attempt
 from stages.run.digests import damage
 from stages.run.failures import as_splat_error
+from stages.run.listener import Listener
 from stages.run.lock import holder
 from stages.run.manifest import Manifest
 from stages.run.planning import PHOTOS, Planner, Step
 from stages.run.runfile import RunFile
 from stages.run.stages import STAGES
+from stages.run.time_limit import within_limit
 from stages.run.workspace import Layout
 
-__all__ = ["Listener", "Pipeline", "Step"]
+__all__ = ["Pipeline", "Step"]
 
 
 class Pipeline:
@@ -248,18 +244,3 @@ class Pipeline:
             wanted="A run folder that can be made and written to.",
             hint="Check the path, or name another folder with --out.",
         )
-
-
-# Of the time left when the stage begins. Pruning takes 0.4 x as long as training, if nothing stops
-# it; quantising and export take 0.15 x as long as a whole `preview`, however short training was.
-TIME_SHARES = {"train": 0.55, "prune": 0.5}
-LEAST_S = 1.0  # seconds
-
-
-def within_limit(stage: str, settings: Any, elapsed: float) -> Any:
-    """The settings of a stage that begins `elapsed` seconds after the command: `seconds`, if set,
-    is the limit of the command, and becomes that of the stage."""
-    seconds = getattr(settings, "seconds", 0.0)
-    if not seconds:
-        return settings
-    return replace(settings, seconds=max(LEAST_S, TIME_SHARES[stage] * (seconds - elapsed)))

@@ -13,7 +13,6 @@ from stages.evaluate.coverage import CameraLayout, Gap, Patches, PoorRegion
 from stages.evaluate.evaluation import Score
 from stages.scene import Camera
 from stages.tradeoff.bootstrap import Difference, paired_difference
-from stages.tradeoff.shimmer import Framing
 
 
 @dataclass(frozen=True)
@@ -84,9 +83,6 @@ class Tradeoff:
         scores: of `own`, by held-out view.
         side_px: longer side of the pictures.
         coverage: what the training views show.
-        framings: how the splats look from other viewpoints.
-        small_psnr_db: of held-out views at a quarter of the size: drawn so, and drawn at full size
-            and scaled down.
         exported: formats that the run wrote.
         on_cpu: whether pictures were drawn, and so timed, on the CPU.
     """
@@ -98,8 +94,6 @@ class Tradeoff:
     scores: tuple[Score, ...]
     side_px: int
     coverage: Coverage
-    framings: tuple[Framing, ...] = ()
-    small_psnr_db: tuple[float, float] = (0.0, 0.0)
     exported: tuple[str, ...] = ()
     on_cpu: bool = True
 

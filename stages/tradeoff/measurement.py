@@ -33,10 +33,8 @@ from stages.scene import (
     Splats,
     View,
     evenly_spaced,
-    look_at,
     split_held_out,
 )
-from stages.scene.framing import median_depth
 from stages.tradeoff.curves import (
     Coverage,
     HistoryPoint,
@@ -45,7 +43,6 @@ from stages.tradeoff.curves import (
     mean_db,
     psnr_change,
 )
-from stages.tradeoff.shimmer import Framing, framings, shimmer, small_psnr_db
 
 # Of the run's splats: those that pruning to a given number is measured at.
 SHARES = (0.85, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1)
@@ -53,7 +50,6 @@ SHARES = (0.85, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1)
 _FLOATER_PIXELS, _MIN_FLOATER_VIEWS = 24e6, 24
 TIMED_FRAMES = 4
 COVERAGE_VIEWS = 200  # at most, that coverage is measured by
-FRAMED_VIEWS = 3  # that extreme framings start from
 
 ProgressCallback = Callable[[str], None]
 PruneTo = Callable[[Splats, int], Splats]
@@ -123,8 +119,6 @@ def measure_tradeoff(inputs: TradeoffInputs, progress: ProgressCallback) -> Trad
         scores=tuple(own_scores),
         side_px=max(max(view.pixels.shape[:2]) for view in inputs.held_out),
         coverage=coverage,
-        framings=measure_framings(splats, inputs.held_out, coverage, inputs.backend),
-        small_psnr_db=small_psnr_db(image_renderer(splats, inputs.backend), inputs.held_out),
         exported=inputs.exported,
         on_cpu=inputs.on_cpu,
     )
@@ -223,22 +217,6 @@ def measure_coverage(
         regions=poorly_covered_regions(splats, patches, cameras, backend) if layout else (),
         floaters=splats.means[is_floater].astype(np.float64),
     )
-
-
-def measure_framings(
-    splats: Splats, held_out: Sequence[EvaluationView], coverage: Coverage, backend: str
-) -> tuple[Framing, ...]:
-    """How the splats look in extreme framings, and from the largest gap of the capture."""
-    draw = image_renderer(splats, backend)
-    cameras = [view.camera for view in evenly_spaced(held_out, FRAMED_VIEWS)]
-    found = framings(draw, [(c, median_depth(c, splats.means)) for c in cameras])
-    layout = coverage.layout
-    if layout and layout.inward and coverage.gaps:
-        eye = layout.middle + layout.distance * coverage.gaps[0].direction
-        pose = look_at(eye, layout.middle, up=layout.up)
-        camera = replace(cameras[0], world_to_camera=pose)
-        found += (Framing("from gap 1", *shimmer(draw, camera, layout.distance)),)
-    return found
 
 
 def floater_views(views: Sequence[View], draw_settings: DrawSettings) -> list[View]:

@@ -95,7 +95,7 @@ def _near_groups(points: Sequence[OperatingPoint]) -> list[list[OperatingPoint]]
 
 
 def _splats(tradeoff: Tradeoff) -> Figure:
-    title = "Fewer splats, smallest contribution removed first, not fine-tuned"
+    title = "Fewer splats, fine-tuned after each removal"
     figure, axes = new_plot(title, "splats", _PSNR)
     _curve(axes, tradeoff, [float(point.splats) for point in tradeoff.pruned])
     axes.xaxis.set_major_formatter("{x:,.0f}")

@@ -26,7 +26,6 @@ _SECTIONS = {
     "splats": ("Splats", summary.about_splats),
     "drawing": ("Drawing", summary.about_drawing),
     "coverage": ("Coverage", summary.about_coverage),
-    "framing": ("Framing", summary.about_framing),
     "photographs": ("Photographs", summary.about_photographs),
 }
 
@@ -55,8 +54,6 @@ def write_report(folder: Path, name: str, tradeoff: Tradeoff, inputs: TradeoffIn
             parts.append(html.png(plots[stem], f"Plot: {title}"))
         if stem == "formats":
             parts.append(_formats_table(tradeoff))
-        if stem == "framing":
-            parts.append(_framings(tradeoff))
     parts += [_photographs_table(tradeoff), _worst(tradeoff, inputs)]
     report = folder / "report.html"
     html.write_page(report, f"Trade-off report: {name}", parts)
@@ -102,15 +99,6 @@ def _photographs_table(tradeoff: Tradeoff) -> str:
         for number, score in enumerate(tradeoff.scores, 1)
     ]
     return html.table(("photograph", "PSNR", "SSIM"), rows)
-
-
-def _framings(tradeoff: Tradeoff) -> str:
-    """Three pictures a row."""
-    shown = [
-        (f"{framing.label}: shimmer {framing.shimmer:.1f} of 255", framing.image)
-        for framing in tradeoff.framings
-    ]
-    return "".join(html.pictures(shown[i : i + 3]) for i in range(0, len(shown), 3))
 
 
 def _worst(tradeoff: Tradeoff, inputs: TradeoffInputs) -> str:

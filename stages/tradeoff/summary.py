@@ -28,7 +28,6 @@ _POSITIONS = (
     ("left", "middle", "right"),
     ("lower left", "bottom", "lower right"),
 )
-_ALIASING_DB = 0.5  # loss of pictures drawn small, against those scaled down
 
 
 def about_time(tradeoff: Tradeoff) -> list[str]:
@@ -136,25 +135,6 @@ def about_coverage(tradeoff: Tradeoff) -> list[str]:
     regions = [region for region in coverage.regions if region.share >= _MIN_REGION_SHARE]
     lines += [_region(coverage, letter, r) for letter, r in zip("abc", regions, strict=False)]
     return [*lines, _floaters(coverage)]
-
-
-def about_framing(tradeoff: Tradeoff) -> list[str]:
-    """What becomes of the picture away from the photographs' own distance and size."""
-    own, *others = tradeoff.framings
-    drawn, scaled = tradeoff.small_psnr_db
-    most = max(others, key=lambda framing: framing.shimmer)
-    lines = [
-        "Shimmer is what a camera movement of half a pixel changes in a picture beyond even "
-        f"motion: {own.shimmer:.1f} of 255 {own.label}, and most {most.label}: {most.shimmer:.1f}.",
-        f"At a quarter of the pixels a side, held-out views have {drawn:.2f} dB; drawn at full "
-        f"size and scaled down, {scaled:.2f} dB.",
-    ]
-    if scaled - drawn > _ALIASING_DB:
-        lines.append(
-            "Splats look thicker where pixels are large. For pictures that small, or from far "
-            "away, draw large and scale down."
-        )
-    return lines
 
 
 def describe_direction(

@@ -8,8 +8,9 @@ from collections.abc import Callable
 
 from stages.base.stage import DrawView, Numbers, Stage
 from stages.page.cameras import page_cameras
+from stages.run.listener import Listener
 from stages.run.manifest import Manifest
-from stages.run.pipeline import Listener, Pipeline
+from stages.run.pipeline import Pipeline
 from stages.viewer.live_page import LivePage
 from stages.viewer.server import LocalServer
 

@@ -30,7 +30,7 @@ def main(source: Path, count: int, target: Path, degree: int | None = None) -> N
         for number, start in enumerate(range(0, count, len(tile))):
             place = (high - low) * (number % wide, 0, number // wide)
             part = _unlike(tile, place, number).take(slice(0, count - start))
-            body = b"".join(ply.blocks(part, "arbitrary"))
+            body = b"".join(ply.file_blocks(part, "arbitrary"))
             file.write(body[body.index(b"end_header\n") + len(b"end_header\n") :])
 
 

@@ -29,7 +29,7 @@ from tests.cameras.models import example
 
 
 def test_every_format_of_the_table_is_drawn() -> None:
-    assert set(MADE) == {row.module for row in CAMERA_FILES}
+    assert set(MADE) == {row.read.__module__.rpartition(".")[2] for row in CAMERA_FILES}
 
 
 @pytest.mark.parametrize("name", [*MADE, "polycam"])
@@ -122,12 +122,7 @@ def _cut(path: Path) -> None:
         ("bundler", "bundle.out"),
         ("metashape", "cameras.xml"),
         ("realityscan", "cameras.csv"),
-        ("odm_shots", "odm_report/shots.geojson"),
-        ("odm_shots", "cameras.json"),
         ("arkit", "frame_00006.json"),
-        ("realityscan_xmp", "p_2.xmp"),
-        ("opf", "project.opf"),
-        ("opf", "calibrated-cameras.json"),
     ],
 )
 def test_half_a_file_is_refused_in_words(tmp_path: Path, name: str, file: str) -> None:

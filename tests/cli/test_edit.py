@@ -16,7 +16,7 @@ from splatcli.commands import edit as command
 from stages import formats
 from stages.base import scratch
 from stages.editing.scene import EditedScene
-from stages.editing.syntax import OPERATIONS, ParsedOperation, parse_file
+from stages.editing.syntax import OPERATIONS
 from stages.scene import Splats, View, look_at
 from tests import scenes
 from tests.cli.help_text import help_of
@@ -155,32 +155,12 @@ def test_where_cameras_are_known_what_is_written_is_proven(
     assert "edit-verify-failed" in err
 
 
-def test_a_file_of_operations_is_done_where_it_stands(source: Path, tmp_path: Path) -> None:
-    ops = tmp_path / "chain.txt"
-    ops.write_text(
-        "# what a viewer selected\nscale 2\n--keep 'x > 0'  # the right half\n\n  decimate=20\n"
-    )
-    edited(source, tmp_path / "b.ply", "--move", "1,0,0", "--ops", ops, "--move", "-1,0,0")
-    words = ("--move", "1,0,0", "--scale", "2", "--keep", "x > 0", "--decimate", "20")
-    edited(source, tmp_path / "c.ply", *words, "--move", "-1,0,0")
-    assert (tmp_path / "b.ply").read_bytes() == (tmp_path / "c.ply").read_bytes()
-
-
-def test_operations_of_a_file_are_read_in_order(tmp_path: Path) -> None:
-    (tmp_path / "ops").write_text("keep x > 0 and y < 1\ndrop-floaters\nmove -1,0,0\n")
-    assert parse_file(tmp_path / "ops") == [
-        ParsedOperation("keep", "x > 0 and y < 1"),
-        ParsedOperation("drop-floaters"),
-        ParsedOperation("move", "-1,0,0"),
-    ]
-
-
 @pytest.mark.parametrize(
     ("words", "code", "status"),
     [
         (["--keep", "x >"], "edit-keep", 2),
         (["--crop", "cube:1"], "edit-region", 2),
-        (["--crop", "hull:none.json"], "edit-hull-unreadable", 3),
+        (["--crop", "hull:none.json"], "edit-region", 2),
         (["--rotate", "y"], "edit-rotate", 2),
         (["--rotate", "0,0,0:20"], "edit-rotate", 2),
         (["--scale", "0"], "edit-scale", 2),
@@ -195,7 +175,6 @@ def test_operations_of_a_file_are_read_in_order(tmp_path: Path) -> None:
         (["--max-mb", "-1"], "edit-max-mb", 2),
         (["--merge", "none.ply"], "file-missing", 3),
         (["--merge", "none.obj"], "format-unknown", 2),
-        (["--ops", "none.txt"], "edit-ops", 2),
         (["--keep", "x > 1e9"], "edit-nothing-left", 2),
         (["--spin", "3"], "command-line", 2),
         (["--keep"], "command-line", 2),
@@ -207,13 +186,6 @@ def test_bad_operations_are_reported_and_nothing_is_written(
     _, err = edited(source, tmp_path / "b.ply", *words, code=status)
     assert f"({code}, exit status {status})" in err
     assert not (tmp_path / "b.ply").exists()
-
-
-@pytest.mark.parametrize("line", ["spin 3", "crop", "drop-floaters now", "keep ''"])
-def test_a_bad_line_is_named_by_its_number(source: Path, tmp_path: Path, line: str) -> None:
-    (tmp_path / "ops").write_text(f"scale 2\n{line}\n")
-    _, err = edited(source, tmp_path / "b.ply", "--ops", tmp_path / "ops", code=2)
-    assert "line 2" in err
 
 
 def test_a_target_with_a_known_suffix_is_required(source: Path, tmp_path: Path) -> None:
@@ -268,5 +240,5 @@ def test_levels_of_detail_go_into_a_folder_that_is_made(source: Path, tmp_path: 
 
 def test_help_names_every_operation() -> None:
     text = help_of("edit")
-    for word in (*OPERATIONS, "ops", "dry-run"):
+    for word in (*OPERATIONS, "dry-run"):
         assert f"--{word}" in text

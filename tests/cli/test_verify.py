@@ -131,7 +131,7 @@ def test_a_file_that_is_not_what_was_trained_ends_in_exit_status_7(
     formats.write(path, mirrored(scene.splats))
     *_, found, error = events(path, code=7)
     assert (found["right"], error["code"]) == (False, "verify-failed")
-    assert "its x, y, z look like -x, y, z" in error["given"]
+    assert "most positions are wrong, by 0." in error["given"]
     out, err = verified(run, code=7)
     assert "wrong" in out
     assert f"scene.{name} is wrong" in err

@@ -14,7 +14,8 @@ from splatcli.distribution import distributed
 from stages.base.errors import Interrupted, SplatError
 from stages.distributed import blocks, partition
 from stages.distributed.tasks import SerialExecutor, TaskResult
-from stages.run.pipeline import Listener, Pipeline
+from stages.run.listener import Listener
+from stages.run.pipeline import Pipeline
 from stages.run.stages import STAGE_NAMES, STAGE_OF
 from stages.scene import save_splats, split_held_out
 from stages.sfm.reconstruction_files import save_reconstruction

@@ -1,13 +1,9 @@
-"""Parts of space, and files of corners."""
+"""Parts of space."""
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
-import trimesh
 
 from stages.base.errors import SplatError
 from stages.editing.regions import parse_region
@@ -15,7 +11,6 @@ from tests import scenes
 
 MEANS = np.random.default_rng(3).uniform(-2, 2, (500, 3))
 CENTRES = scenes.splats(MEANS).means.astype(np.float64)
-CORNERS = [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
 
 
 def test_a_box_and_a_ball() -> None:
@@ -25,15 +20,6 @@ def test_a_box_and_a_ball() -> None:
     ball = parse_region("sphere:0.5,0,0,1.2")(CENTRES)
     assert (ball == (np.linalg.norm(means - [0.5, 0, 0], axis=1) <= 1.2)).all()
     assert 0 < ball.sum() < 500
-
-
-def test_a_hull_of_the_corners_of_a_box_is_the_box(tmp_path: Path) -> None:
-    (tmp_path / "points.json").write_text(json.dumps(CORNERS))
-    mesh = trimesh.Trimesh(CORNERS, trimesh.creation.box((2, 2, 2)).faces, process=False)
-    mesh.export(tmp_path / "points.ply")
-    wanted = parse_region("box:-1,-1,-1,1,1,1")(CENTRES)
-    for name in ("points.json", "points.ply"):
-        assert (parse_region(f"hull:{tmp_path / name}")(CENTRES) == wanted).all()
 
 
 def test_a_lasso_is_what_lies_before_the_camera_and_within_its_corners() -> None:
@@ -52,33 +38,10 @@ def test_a_lasso_is_what_lies_before_the_camera_and_within_its_corners() -> None
     [
         *("lasso:", "lasso:1,2,3", "lasso:" + "1," * 15 + "1", "lasso:" + "1," * 18 + "1"),
         *("box", "box:1,2,3", "box:1,1,1,0,0,0", "box:a,b,c,d,e,f"),
-        *("sphere:0,0,0,-1", "sphere:0,0,0,nan", "ball:0,0,0,1", "", "hull:"),
+        *("sphere:0,0,0,-1", "sphere:0,0,0,nan", "ball:0,0,0,1", "", "hull:a.json"),
     ],
 )
 def test_what_names_no_part_of_space_is_refused(text: str) -> None:
     with pytest.raises(SplatError) as refused:
         parse_region(text)
     assert refused.value.code == "edit-region"
-
-
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [
-        ("flat.json", json.dumps([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])),
-        ("few.json", "[[1, 2, 3]]"),
-        ("words.json", '{"a": 1}'),
-        ("broken.json", "[[1, 2"),
-        ("nan.json", "[[NaN, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]"),
-        ("text.ply", "no ply at all"),
-        ("none.ply", None),
-    ],
-)
-def test_points_that_are_no_hull_are_refused(
-    tmp_path: Path, name: str, content: str | None
-) -> None:
-    if content is not None:
-        (tmp_path / name).write_text(content)
-    with pytest.raises(SplatError) as refused:
-        parse_region(f"hull:{tmp_path / name}")
-    assert refused.value.code == "edit-hull-unreadable"
-    assert name in refused.value.given

@@ -21,6 +21,7 @@ from stages.mesh import fuse
 from stages.proof import checks
 from stages.proof.content import FileContent
 from stages.scene import ExportedAssets, QuantisedSplats, Splats
+from stages.scene.mesh import Mesh
 from tests.small_scene import SmallScene, small_scene
 
 
@@ -237,11 +238,16 @@ def test_a_mesh_alone_of_as_many_triangles_as_asked(
     assert 400 < report.metrics["mesh"]["triangles"] <= 500
 
 
+def write_no_mesh(path: Path, mesh: Mesh, units: str) -> None:
+    path.write_bytes(b"ply\n")
+
+
 def test_a_wrong_mesh_does_not_pass(
     scene: SmallScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fuse, "VOXELS", 48**3)
-    monkeypatch.setattr(files, "write_ply", lambda path, mesh, units: path.write_bytes(b"ply\n"))
+    right = files.CODECS_OF_MESHES["mesh.ply"]
+    monkeypatch.setitem(files.CODECS_OF_MESHES, "mesh.ply", replace(right, write=write_no_mesh))
     with pytest.raises(SplatError, match=r"scene\.mesh\.ply came out wrong") as caught:
         exported(scene, tmp_path, formats=("mesh.ply",))
     assert (caught.value.code, caught.value.family) == ("export-verify-failed", Family.QUALITY)

@@ -5,39 +5,36 @@ from __future__ import annotations
 import inspect
 from dataclasses import replace
 from pathlib import Path
-from pkgutil import resolve_name
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from stages import formats
 from stages.base.errors import Family, SplatError
 from stages.formats import BY_ENDING, FORMATS, Format
-from stages.formats.mesh_table import MESHES, MeshFormat
-from stages.proof.checks import CHECKS, byte_breakdown_of
+from stages.formats.codecs import CODECS
+from stages.formats.mesh_files import CODECS_OF_MESHES
+from stages.formats.mesh_table import MESHES
+from stages.proof.checks import CHECKS
+from stages.scene import Splats
 from tests.formats.files import read
 from tests.formats.truth import many_splats
 
-PLACES = (
-    *("writer", "reader", "units", "independent_reader", "order", "quantiser", "parts"),
-    *("position_loss", "size_loss"),
-)
-ROWS: list[Format | MeshFormat] = [*BY_ENDING.values(), *MESHES.values()]
+
+def test_every_format_has_its_functions_and_its_checks() -> None:
+    assert list(CODECS) == list(CHECKS) == list(BY_ENDING)
+    assert list(CODECS_OF_MESHES) == list(MESHES)
 
 
-@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.ending)
-def test_every_function_that_a_row_names_exists(row: Format | MeshFormat) -> None:
-    for place in filter(None, (getattr(row, name, "") for name in PLACES)):
-        assert callable(resolve_name(place)), place
-
-
-def test_every_format_has_its_checks() -> None:
-    assert list(CHECKS) == list(BY_ENDING)
+def rows_of_file(row: Format, splats: Splats) -> NDArray[np.intp]:
+    order = CODECS[row.ending].order
+    return order(splats) if order else np.arange(len(splats))
 
 
 @pytest.mark.parametrize("row", FORMATS.values(), ids=lambda row: row.ending)
 def test_a_writer_takes_views_where_its_row_says_so(row: Format) -> None:
-    assert ("views" in inspect.signature(resolve_name(row.writer)).parameters) == row.takes_views
+    assert ("views" in inspect.signature(CODECS[row.ending].write).parameters) == row.takes_views
 
 
 @pytest.mark.parametrize("row", FORMATS.values(), ids=lambda row: row.ending)
@@ -45,7 +42,7 @@ def test_rows_of_a_file_are_in_the_order_of_the_table(tmp_path: Path, row: Forma
     splats = many_splats(200)
     path = tmp_path / f"a.{row.ending}"
     formats.write(path, splats)
-    order = resolve_name(row.order)(splats) if row.order else np.arange(200)
+    order = rows_of_file(row, splats)
     back = read(path)
     np.testing.assert_allclose(back.means, splats.means[order], atol=0.02)
     assert back.sh_degree == row.sh_degree
@@ -56,7 +53,7 @@ def test_formats_lose_what_their_rows_declare_and_nothing_else(tmp_path: Path, r
     splats = many_splats(200)
     path = tmp_path / f"a.{row.ending}"
     formats.write(path, splats)
-    order = resolve_name(row.order)(splats) if row.order else np.arange(200)
+    order = rows_of_file(row, splats)
     back, wanted = read(path).with_sh_degree(3), splats.take(order)
     pairs = [(getattr(back, n), getattr(wanted, n)) for n in ("means", "sh", "opacities")]
     same = all(np.allclose(a, b, atol=1e-6) for a, b in pairs)
@@ -69,19 +66,6 @@ def test_a_format_leaves_the_files_that_its_row_names(tmp_path: Path, row: Forma
     formats.write(path, replace(many_splats(9), origin=np.zeros(3)))
     assert sorted(row.files(path)) == sorted(tmp_path.iterdir())
     assert row.size_bytes(path) == sum(file.stat().st_size for file in tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("row", FORMATS.values(), ids=lambda row: row.ending)
-def test_every_format_has_a_byte_breakdown_or_a_reason(tmp_path: Path, row: Format) -> None:
-    path = tmp_path / f"a.{row.ending}"
-    formats.write(path, many_splats(300))
-    found = byte_breakdown_of(path)
-    if found.unknown:
-        assert not found.parts
-    else:
-        assert {"positions", "rotations", "scales"} <= found.parts.keys()
-        assert found.parts["positions"] >= 300 * 4
-        assert found.unpacked or sum(found.parts.values()) <= row.size_bytes(path)
 
 
 @pytest.mark.parametrize("ending", MESHES)

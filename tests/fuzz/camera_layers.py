@@ -20,11 +20,8 @@ from stages.cameras import (
     llff,
     metashape,
     nerfstudio,
-    odm_shots,
     opensfm,
-    opf,
     realityscan,
-    realityscan_xmp,
 )
 from stages.scene import Camera, View
 from tests.cameras.drawn_surveys import MADE, NAMES
@@ -179,15 +176,7 @@ LAYERS = {
     "RealityScan cameras.csv": _other(realityscan, "cameras.csv"),
     "Bundler bundle.out": _other(bundler, "bundle.out"),
     "Bundler list.txt": replace(_other(bundler, "list.txt"), read=_bundle_of_list),
-    "ODM shots.geojson": _other(odm_shots, "odm_report/shots.geojson"),
-    "ODM cameras.json": _other(odm_shots, "cameras.json", source="odm_report/shots.geojson"),
     "ARKit frame_00006.json": _other(arkit, "frame_00006.json", source="."),
-    "RealityScan .xmp": _other(realityscan_xmp, "p_1.xmp", source="."),
-    "OPF project.opf": _other(opf, "project.opf"),
-    **{
-        f"OPF {part}.json": _other(opf, f"{part}.json", source="project.opf")
-        for part in ("calibrated-cameras", "input-cameras", "scene-reference-frame")
-    },
     "transforms.json": Layer(
         "transforms.json",
         _content("json", "transforms.json"),

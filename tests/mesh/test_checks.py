@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from pkgutil import resolve_name
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from pygltflib import GLTF2
 
 from stages import formats
 from stages.base.errors import SplatError
-from stages.formats.mesh_files import fault_of
+from stages.formats.mesh_files import CODECS_OF_MESHES
 from stages.formats.mesh_table import MESHES
 from stages.scene.mesh import Mesh
 
@@ -31,9 +30,9 @@ def tent() -> Mesh:
 
 def write(path: Path, mesh: Mesh, units: str = "metres") -> str:
     """Write by the table; what the independent reader has to say of it."""
-    row = MESHES[path.name.removeprefix("a.")]
-    resolve_name(row.writer)(path, mesh, units)
-    return fault_of(path, row, mesh)
+    codec = CODECS_OF_MESHES[path.name.removeprefix("a.")]
+    codec.write(path, mesh, units)
+    return codec.fault_of(path, mesh)
 
 
 def test_the_tent_is_closed_and_its_normals_point_out() -> None:
@@ -113,7 +112,7 @@ def test_a_wrong_file_is_seen(tmp_path: Path, name: str, damage: str) -> None:
     write(path, mesh)
     if damage == "cut short":
         path.write_bytes(path.read_bytes()[:-7])
-    assert fault_of(path, MESHES[name], tent())
+    assert CODECS_OF_MESHES[name].fault_of(path, tent())
 
 
 @pytest.mark.parametrize("name", MESHES)

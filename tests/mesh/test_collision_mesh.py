@@ -17,7 +17,6 @@ from tests.mesh.shapes import (
     CENTRE,
     all_around,
     ball,
-    directions,
     joined,
     seen_from,
     sphere,
@@ -48,8 +47,6 @@ def test_a_sphere_seen_from_all_sides_is_that_sphere() -> None:
     assert figures["watertight"]
     assert figures["triangles"] == len(mesh.faces) > 1000
     assert figures["covered_share"] > 0.99
-    assert figures["sparse_points_inside_share"] == 1
-    assert figures["sparse_p90_distance"] < MESH_VOXELS * figures["voxel"]
     assert report.warnings == []
     # outwards, towards the cameras, by the corners' order and by the normals
     assert ((mesh.normals() * away).sum(axis=1) > 0.8 * radii).all()
@@ -106,16 +103,6 @@ def test_nothing_solid_is_an_empty_mesh_with_a_warning(what: str) -> None:
     found, report = made(splats, views)
     assert len(found.mesh.faces) == found.figures["triangles"] == 0
     assert [code for code, _ in report.warnings] == ["export-mesh-empty"]
-
-
-def test_the_distance_of_sparse_points_is_reported() -> None:
-    views = all_around()
-    shifted = replace(views, points=CENTRE + 1.05 * directions(300))
-    found, _ = made(sphere(), shifted)
-    assert found.figures["sparse_median_distance"] == pytest.approx(0.05, abs=0.02)
-    found, _ = made(sphere(), replace(views, points=CENTRE + 50 * directions(300)))
-    assert found.figures["sparse_points_inside_share"] == 0
-    assert found.figures["sparse_median_distance"] is None
 
 
 def test_little_memory_means_larger_voxels_and_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,9 +23,10 @@ from stages.base.memory import resident_mib
 from stages.cameras import nerfstudio
 from stages.run import manifest
 from stages.run.failures import as_splat_error
+from stages.run.listener import Listener
 from stages.run.lock import HOLDER, locked
 from stages.run.manifest import SCHEMA, Manifest, read_sealed
-from stages.run.pipeline import Listener, Pipeline
+from stages.run.pipeline import Pipeline
 from stages.run.runfile import RunFile
 from stages.run.runfolder import is_run_folder
 from stages.scene.storage import load_splats

@@ -10,7 +10,8 @@ import pytest
 
 from stages.base.stage import Stage
 from stages.prune.settings import PruneSettings
-from stages.run.pipeline import LEAST_S, Pipeline, within_limit
+from stages.run.pipeline import Pipeline
+from stages.run.time_limit import LEAST_S, within_limit
 from stages.train.settings import TrainSettings
 from tests.run.fakes import photographs
 

@@ -5,17 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 
-from stages.evaluate.evaluation import EvaluationView
 from stages.scene import DrawSettings, Splats, View
 from stages.tradeoff.curves import Coverage, Tradeoff
-from stages.tradeoff.measurement import measure_coverage, measure_framings
-from stages.tradeoff.shimmer import Framing
-from stages.tradeoff.summary import about_coverage, about_framing
-from tests.evaluate.rings import ball, camera, place, ring, surface
+from stages.tradeoff.measurement import measure_coverage
+from stages.tradeoff.summary import about_coverage
+from tests.evaluate.rings import ball, place, ring, surface
 
 
 def ball_splats() -> Splats:
@@ -34,11 +32,6 @@ def coverage_of(
 
 def coverage_text(coverage: Coverage) -> str:
     return "\n".join(about_coverage(cast(Tradeoff, SimpleNamespace(coverage=coverage))))
-
-
-def framing_text(framings: Sequence[Framing], small_psnr_db: tuple[float, float]) -> str:
-    values: Any = SimpleNamespace(framings=framings, small_psnr_db=small_psnr_db)
-    return "\n".join(about_framing(values))
 
 
 def first_gap(coverage: Coverage) -> str:
@@ -69,20 +62,6 @@ def test_floaters_are_named_by_the_nearest_photograph() -> None:
     text = coverage_text(replace(coverage, floaters=before))
     assert "4 splats are floaters" in text
     assert "most of them near at 120 (3), at 0 (1)" in text
-
-
-def test_the_framing_that_shimmers_most_is_named() -> None:
-    view = EvaluationView("a", camera(place(0)), np.full((72, 96, 3), 128, np.uint8))
-    found = measure_framings(ball_splats(), [view], coverage_of([-30, 0, 30]), "cpu")
-    assert found[-1].label == "from gap 1"
-    loud = replace(found[2], shimmer=99.0)
-    assert f"most {loud.label}: 99.0" in framing_text((found[0], loud), (29.0, 29.1))
-
-
-def test_pictures_that_thicken_when_small_should_be_scaled_down() -> None:
-    found = [Framing(label, np.zeros((1, 1, 3), np.float32), 1.0) for label in "ab"]
-    assert "scale down" in framing_text(found, (18.0, 29.0))
-    assert "Splats look thicker" not in framing_text(found, (29.0, 29.1))
 
 
 def test_a_capture_that_shows_no_splat_is_reported() -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from stages.scene import Camera
-from stages.viewer.live_page import LARGEST_SHARE, Frame, LiveFrames
+from stages.viewer.live_frames import LARGEST_SHARE, Frame, LiveFrames
 from tests import scenes
 
 WAIT_S = 20.0
