@@ -19,7 +19,7 @@ _LACK_OF_MEMORY = ("SIGKILL", "SIGSEGV", "SIGBUS")
 def python_module(name: str, *arguments: str) -> list[str]:
     """The command that runs a module of the project.
 
-    -P: modules in the current folder, such as a file named numpy.py, must not be imported."""
+    -P: modules in the current folder, such as a file named `numpy.py`, must not be imported."""
     return [sys.executable, "-P", "-m", name, *arguments]
 
 

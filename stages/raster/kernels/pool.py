@@ -34,7 +34,7 @@ class Pool:
         *args: Any,
         beside: Callable[[], Any] | None = None,
     ) -> None:
-        """Call kernel(counter, *args) in every thread; the kernel takes tickets from `counter`.
+        """Call kernel(counter, *args) in every thread; see `take_ticket` for the counter.
 
         beside: a function that the calling thread runs first, while the others begin.
         """

@@ -20,7 +20,7 @@ def median_inlier_ratio(
     world_to_camera: NDArray[np.float64],
     side: float,
 ) -> float | None:
-    """The median over pairs of `fitting_shares`; None without pairs, and where all are seen from
+    """The median over pairs of `inlier_ratios`; None without pairs, and where all are seen from
     one place."""
     ratios = inlier_ratios(pairs, intrinsics, world_to_camera, side)
     ratios = ratios[~np.isnan(ratios)]

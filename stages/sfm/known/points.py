@@ -40,7 +40,7 @@ def find_points(
 
     Args:
         from_file: the points of the camera file; used if its cameras look at them.
-        triangulated: points.npz of `known_cameras_worker`.
+        triangulated: points.npz of `known.worker`.
         training: positions of the views that may be used.
         views: all.
         whole: [V] a pinhole camera of each view's photograph, the same for those of one.
