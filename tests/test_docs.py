@@ -21,7 +21,11 @@ from tests.docs_tables import PAGES, ROOT, renewed
 
 COMMANDS = {name: loaded(name) for name in ENTRIES}
 GUIDE = (ROOT / "README.md", *sorted((ROOT / "docs" / "guide").glob("*.md")))
+EXPERIMENTS = sorted(
+    page for page in (ROOT / "docs" / "experiments").glob("*.md") if page.stem != "index"
+)
 README_LINES = 200
+SUMMARY_WORDS = 450  # of a page of experiments
 _CODE = re.compile(r"[a-z0-9]+(?:-[a-z0-9]+)+$")
 # Strings of the source that look like codes and are something else.
 _NO_CODES = {
@@ -118,6 +122,31 @@ def test_links_lead_somewhere(page: Path) -> None:
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
         if not target.startswith(("http://", "https://")):
             assert (page.parent / target).exists(), target
+
+
+def _anchor(heading: str) -> str:
+    text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading.strip().lower())
+    return re.sub(r"\s+", "-", re.sub(r"[^\w\s-]", "", text))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_id)
+def test_links_lead_to_headings(page: Path) -> None:
+    for target, anchor in re.findall(r"\]\(([^)#\s]*)#([^)]+)\)", page.read_text("utf-8")):
+        if target.startswith(("http://", "https://")):
+            continue
+        text = (page.parent / target if target else page).read_text(encoding="utf-8")
+        headings = {_anchor(heading) for heading in re.findall(r"^#+ (.*)$", text, re.M)}
+        assert anchor in headings, f"{target}#{anchor}"
+
+
+@pytest.mark.parametrize("page", EXPERIMENTS, ids=page_id)
+def test_experiments_begin_with_a_page_of_what_was_decided(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    summary, details = text.split("\n## Details\n")
+    assert "**Summary.**" in summary
+    assert "\n|--" in summary.replace(" ", ""), "a table of decisions"
+    assert len(summary.split()) <= SUMMARY_WORDS
+    assert details.strip()
 
 
 def test_map_names_every_module() -> None:
