@@ -1,4 +1,4 @@
-"""Child processes: they end with their parent, and how they ended is said."""
+"""Child processes: start them so that they end with their parent, and describe how they ended."""
 
 from __future__ import annotations
 

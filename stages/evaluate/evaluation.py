@@ -77,7 +77,7 @@ class EvaluationView:
 
     def scaled(self, scale: float) -> EvaluationView:
         """At `scale` (at most 1) times the size along each side, by area averaging as in
-        `scene.pictures`. A pixel is compared if all that it averages is."""
+        `scene.pictures`. A pixel is compared if all pixels that it averages are."""
         if scale == 1:
             return self
         camera = self.camera.resized(

@@ -43,7 +43,7 @@ def find_points(
         triangulated: points.npz of `known.worker`.
         training: positions of the views that may be used.
         views: all.
-        whole: [V] a pinhole camera of each view's photograph, the same for those of one.
+        whole: [V] a pinhole camera of each view's photograph; views of one photograph share it.
         folder: of the reconstruction, for masks.
         seed: of random points.
         report: receives the metric "points_source" and warnings.
