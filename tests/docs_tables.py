@@ -71,34 +71,41 @@ def _table(head: tuple[str, ...], rows: Rows) -> str:
     return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
 
 
-def _first_sentence(path: Path) -> str:
+def _summary(path: Path) -> str:
     """The first paragraph of a module's docstring."""
     text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
     return " ".join(text.split("\n\n")[0].split()).replace("|", r"\|")
 
 
-def _path_of(module: str) -> Path:
-    found = ROOT.joinpath(*module.split("."))
-    return found / "__init__.py" if found.is_dir() else found.with_suffix(".py")
+def in_reading_order(folder: Path) -> list[Path]:
+    """Modules of a package: as the docstring of `__init__` names them, then by name."""
+    text = ast.get_docstring(ast.parse((folder / "__init__.py").read_text("utf-8"))) or ""
+    named = [name.split(".")[0] for name in re.findall(r"`([\w.]+)`", text)]
+    return sorted(
+        (path for path in folder.glob("*.py") if path.name != "__init__.py"),
+        key=lambda p: (named.index(p.stem) if p.stem in named else len(named), p.stem),
+    )
 
 
-def layers() -> str:
-    rows: list[tuple[str, ...]] = []
-    for number, packages in enumerate(LAYERS):
-        for package in packages:
-            if package == "stages":
-                continue
-            path = _path_of(package)
-            name = f"{package.replace('.', '/')}{'.py' if path.name != '__init__.py' else '/'}"
-            rows.append((str(number), f"`{name}`", _first_sentence(path)))
-    return _table(("layer", "package", "contents"), rows)
+def modules_of(folder: Path) -> str:
+    """What a package is, the table of its own modules, and the same for packages inside it."""
+    name = folder.relative_to(ROOT).as_posix()
+    rows = [(f"`{path.name}`", _summary(path)) for path in in_reading_order(folder)]
+    table = _table((f"module of `{name}/`", "contents"), rows)
+    below = [path.parent for path in sorted(folder.glob("*/__init__.py"))]
+    return "\n".join(
+        [f"{_summary(folder / '__init__.py')}\n\n{table}", *(modules_of(path) for path in below)]
+    )
 
 
-def modules(package: str) -> str:
-    folder = ROOT / package
-    found = sorted(folder.glob("*.py"))
-    rows = [(f"`{p.name}`", _first_sentence(p)) for p in found if p.name != "__init__.py"]
-    return _table((f"module of `{package}/`", "contents"), rows)
+def modules() -> str:
+    """Tables of all modules, packages in the order of the layers."""
+    parts = []
+    for number, layer in enumerate(LAYERS):
+        for package in (package for package in layer if package != "stages"):
+            name = package.replace(".", "/")
+            parts.append(f"### `{name}/` (layer {number})\n\n{modules_of(ROOT / name)}")
+    return "\n" + "\n".join(parts) + "\n"
 
 
 def stages() -> str:
@@ -212,7 +219,6 @@ def errors() -> str:
 
 
 TABLES: dict[str, Callable[[], str]] = {
-    "layers": layers,
     "stages": stages,
     "formats": formats,
     "format-modules": format_modules,
@@ -222,7 +228,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "operations": operations,
     "commands": commands,
     "errors": errors,
-    "modules-splatcli": lambda: modules("splatcli"),
+    "modules": modules,
 }
 
 

@@ -16,11 +16,16 @@ from stages.formats.table import TABLE
 from stages.run.stages import STAGE_NAMES
 from stages.train.settings import PRESETS
 from tests.docs_commands import bash_lines, inline_commands, splat_commands
+from tests.docs_picture import EVERYWHERE, PICTURE, Drawing, imports, reached_from
 from tests.docs_tables import PAGES, ROOT, renewed
 
 COMMANDS = {name: loaded(name) for name in ENTRIES}
 GUIDE = (ROOT / "README.md", *sorted((ROOT / "docs" / "guide").glob("*.md")))
+EXPERIMENTS = sorted(
+    page for page in (ROOT / "docs" / "experiments").glob("*.md") if page.stem != "index"
+)
 README_LINES = 200
+SUMMARY_WORDS = 450  # of a page of experiments
 _CODE = re.compile(r"[a-z0-9]+(?:-[a-z0-9]+)+$")
 # Strings of the source that look like codes and are something else.
 _NO_CODES = {
@@ -96,11 +101,66 @@ def test_generated_tables_are_those_of_the_code(page: Path) -> None:
     assert renewed(text) == text, "stale: run python -m tests.docs_tables"
 
 
+def test_picture_of_the_packages_is_that_of_the_imports() -> None:
+    drawing = Drawing()
+    assert PICTURE.read_text("utf-8") == drawing.svg(), "stale: run python -m tests.docs_picture"
+    upward = [(a, b) for a, b in drawing.arrows if drawing.rows[a] >= drawing.rows[b]]
+    assert not upward
+
+
+def test_arrows_of_the_picture_lead_to_every_import() -> None:
+    """What is left out follows from what is drawn."""
+    drawn: dict[str, set[str]] = {package: set() for package in imports()}
+    for source, target in Drawing().arrows:
+        drawn[target].add(source)
+    for package, others in imports().items():
+        assert others - {*EVERYWHERE} == reached_from(drawn, package) & others
+
+
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "CONTRIBUTING.md"], ids=page_id)
 def test_links_lead_somewhere(page: Path) -> None:
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
         if not target.startswith(("http://", "https://")):
             assert (page.parent / target).exists(), target
+
+
+def _anchor(heading: str) -> str:
+    text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading.strip().lower())
+    return re.sub(r"\s+", "-", re.sub(r"[^\w\s-]", "", text))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_id)
+def test_links_lead_to_headings(page: Path) -> None:
+    for target, anchor in re.findall(r"\]\(([^)#\s]*)#([^)]+)\)", page.read_text("utf-8")):
+        if target.startswith(("http://", "https://")):
+            continue
+        text = (page.parent / target if target else page).read_text(encoding="utf-8")
+        headings = {_anchor(heading) for heading in re.findall(r"^#+ (.*)$", text, re.M)}
+        assert anchor in headings, f"{target}#{anchor}"
+
+
+@pytest.mark.parametrize("page", EXPERIMENTS, ids=page_id)
+def test_experiments_begin_with_a_page_of_what_was_decided(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    summary, details = text.split("\n## Details\n")
+    assert "**Summary.**" in summary
+    assert "\n|--" in summary.replace(" ", ""), "a table of decisions"
+    assert len(summary.split()) <= SUMMARY_WORDS
+    assert details.strip()
+
+
+def test_map_names_every_module() -> None:
+    """In a table of its package, once, with something to say."""
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    for top in ("stages", "splatcli"):
+        for path in (ROOT / top).rglob("*.py"):
+            if path.name == "__init__.py":
+                continue
+            name, folder = path.name, path.parent.relative_to(ROOT).as_posix()
+            head = f"| module of `{folder}/` | contents |"
+            assert text.count(head) == 1, folder
+            table = text.split(head)[1].split("\n\n")[0].split("<!--")[0]
+            assert re.search(rf"^\| `{re.escape(name)}` \| \S", table, re.M), path
 
 
 def source_of(path: Path) -> str:
@@ -120,8 +180,9 @@ def test_paths_and_names_of_the_code_exist(page: Path) -> None:
     names = {
         path.name for top in ("stages", "splatcli", "tests") for path in (ROOT / top).rglob("*")
     }
-    for name in re.findall(r"`(\w+\.(?:py|cpp))`", text):
-        assert name in names, name
+    for name in re.findall(r"`([\w/]+\.(?:py|cpp))`", text):
+        assert name.split("/")[-1] in names, name
+        assert "/" not in name or (ROOT / name).exists(), f"{name} begins at the repository's root"
     for module in re.findall(r"python -m ((?:stages|tests)[\w.]*)", text):
         found = ROOT.joinpath(*module.split("."))
         assert found.with_suffix(".py").exists() or (found / "__main__.py").exists(), module

@@ -1,7 +1,7 @@
 """Words that were given up for the field's own do not come back: stages, splatcli, docs, README.
 
 A row names the words, what to write instead, and where they mean nothing else. Parts of identifiers
-count: `lent_photographs` holds "lent".
+count: `settled_rates` holds "settled".
 """
 
 from __future__ import annotations
@@ -23,24 +23,17 @@ SUFFIXES = (".py", ".md", ".js", ".html", ".css")
 @dataclass(frozen=True)
 class Word:
     """pattern: a regular expression; parts of snake_case and CamelCase names are words too.
-    instead: what to write. reason: of an exception. exact: the pattern as it is, case included.
+    instead: what to write. reason: of an exception.
     """
 
     pattern: str
     instead: str
     where: tuple[str, ...] = EVERYWHERE
     reason: str = ""
-    exact: bool = False
 
 
 WORDS = (
     Word("judg(e|es|ed|ing|ement)", "held-out (test) views; evaluation, evaluate"),
-    Word("lent|lends?", "validation views"),
-    Word("by[ _-]heart", "overfitting, overfitted"),
-    Word("(sits?|sat|sitting)[ _]out|resting", "dropout, dropped"),
-    Word("open[ _]air", "floaters, free space"),
-    Word("(?<!RANSAC )trials?", "validation probe", (*TRAINING, "docs"), "RANSAC has trials"),
-    Word("answers?|answered", "result of the validation probe", TRAINING, "a server may answer"),
     Word("doubts?|doubtful", "a threshold with a name, a warning"),
     Word("way (back|there)", "backward pass, forward pass"),
     Word("backwards|forwards and", "backward pass, forward pass"),
@@ -52,7 +45,6 @@ WORDS = (
         "SH coefficients, SH degree",
         reason='"bands": a key of SOG',
     ),
-    Word("passed[ _]on", "generalisation ratio"),
     Word("hands", "executor; a verb: sends, gives"),
     Word(
         "(?-i:in shares)|shares? of (features|match|structure|its|it|one)",
@@ -63,38 +55,14 @@ WORDS = (
     Word("makers?", "provenance, backends"),
     Word("told(?! apart)", "reported, given, known", reason="`compare` tells two runs apart"),
     Word("asked", "requested, given; or what is done"),
-    Word(r"\bLook(?= *[(\[,|)])|\blook_of\b|\.look\b", "DrawSettings", CODE, exact=True),
-    Word("first look", "preselection of pairs"),
     Word("settl(e|es|ed|ing)", "learning-rate decay; colour refit; robust bundle adjustment"),
     Word("prices?", "pruning strength, Lagrange multiplier, cost in bits"),
     Word("pays? (for )?(its|their|his) way", "contribution"),
-    Word(
-        r"_worth\b|\bworth_|\bworth [=:]|\bworth[,()\[]|Worth\b",
-        "contribution; or the figure itself",
-        CODE,
-        "a name; what a thing is worth may be said in a sentence",
-        exact=True,
-    ),
-    Word("ground floor|house|floors", "layer, architecture"),
-    Word("rooms|(this|that|every) room", "package", CODE, "docs speak of photographed rooms"),
-    Word(r"(base|editing|capacity|structure|tradeoff)[./](thin_)?words", "text, syntax, summary"),
     Word("rungs?|climb(s|ed|ing)?|ladder", "fallback, attempt"),
-    Word(r"(class |: |\[|-> )Photograph\b", "the view types of `scene`", CODE, exact=True),
-    Word("onlookers?", "live preview"),
     Word("wish(es|ed)?", "request, option"),
-    Word(r"\b_?Wanted\b(?!:)", "Options", CODE, exact=True),
-    Word(r"(Tell|Say) = |: (Tell|Say)\b", "progress callback", CODE, exact=True),
-    Word(r"distributed[./]far|FarRun", "remote", CODE),
-    Word(r"class Place\b", "Location", CODE, exact=True),
     Word("witness(es)?", "visibility constraints"),
     Word("(?<!fine)(?<!fine[-_ ])tun(ed|er|ing)", "fine-tuned, fine-tuning"),
     Word(r"(?<![._])fitted", "fine-tuned", TRAINING, "Camera.fitted changes its size"),
-    Word(r"\b(Aim|Shrinking|Outcome)\b", "Targets, Pruner, PruningResult", CODE, exact=True),
-    Word("census|curiosit(y|ies)", "statistics"),
-    Word("chains? of operations", "operations"),
-    Word(r"\bTyped\b", "ParsedOperation", CODE, exact=True),
-    Word("frugal", "memory-limited training step"),
-    Word(r"capture is thin|thin_words|tradeoff[./]thin", "poorly covered"),
 )
 
 
@@ -114,7 +82,7 @@ def texts() -> dict[str, str]:
 def found(word: Word) -> list[str]:
     """ "path:line: text" of each line that holds the word."""
     word_start = "(?:(?<![A-Za-z])|(?<=[a-z])(?=[A-Z]))"
-    pattern = word.pattern if word.exact else f"{word_start}(?i:{word.pattern})(?![a-z])"
+    pattern = f"{word_start}(?i:{word.pattern})(?![a-z])"
     hits = []
     for path, text in texts().items():
         if any(path == top or path.startswith(top + "/") for top in word.where):

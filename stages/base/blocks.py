@@ -15,7 +15,8 @@ ROWS = 1 << 16  # 16 MB of splats of degree 3
 
 
 def blocks(count: int, rows: int = ROWS) -> Iterator[slice]:
-    """0..count in slices of `rows`. Pages of scratch arrays are released after each."""
+    """Slices of at most `rows` that cover 0..count. Pages of scratch arrays are released after
+    each."""
     for start in range(0, count, rows):
         yield slice(start, min(start + rows, count))
         release_scratch_pages()

@@ -1,4 +1,4 @@
-"""What a disk refuses: room, and permission."""
+"""Errors for what a disk refuses: room, and permission."""
 
 from __future__ import annotations
 

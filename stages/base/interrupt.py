@@ -10,7 +10,7 @@ from types import FrameType
 
 
 def signals(*names: str) -> list[signal.Signals]:
-    """Those of these names that the system has."""
+    """The signals of these names; names that the system does not have are left out."""
     return [getattr(signal, name) for name in names if hasattr(signal, name)]
 
 

@@ -1,4 +1,4 @@
-"""Child processes: they end with their parent, and how they ended is said."""
+"""Child processes: start them so that they end with their parent, and describe how they ended."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _LACK_OF_MEMORY = ("SIGKILL", "SIGSEGV", "SIGBUS")
 def python_module(name: str, *arguments: str) -> list[str]:
     """The command that runs a module of the project.
 
-    -P: modules in the current folder, such as a file named numpy.py, must not be imported."""
+    -P: modules in the current folder, such as a file named `numpy.py`, must not be imported."""
     return [sys.executable, "-P", "-m", name, *arguments]
 
 

@@ -69,7 +69,7 @@ class Setting:
     midway: bool = False
 
     def check(self, value: Any) -> None:
-        """Raises SplatError "option-value" for a value out of bounds."""
+        """Check a value. Raises SplatError "option-value" if it is out of bounds."""
         if value is None and self.optional:
             return
         items = value if self.many and isinstance(value, (tuple, list)) else (value,)
@@ -179,7 +179,8 @@ def check_settings(settings: Any) -> None:
 
 
 def changed(settings: Any, typed: Mapping[str, Any]) -> Any:
-    """`settings` with the typed fields that it has, checked. Raises as `check_settings`."""
+    """`settings` with those of the typed values that belong to it, checked. Raises as
+    `check_settings`."""
     defaults = {field.name: field.default for field in fields(settings)}
     values = {name: value for name, value in typed.items() if name in defaults}
     values |= {name: defaults[name] for name, value in values.items() if value is UNSET}

@@ -1,5 +1,4 @@
-"""Text for readers: numbers with their nouns, names that a terminal can show, and what a library
-said."""
+"""Text for readers: numbers with their nouns, printable names, reasons that a library gives."""
 
 from __future__ import annotations
 

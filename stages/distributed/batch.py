@@ -75,7 +75,7 @@ class BatchTable:
 
     @property
     def location(self) -> Location:
-        """Of batch.csv."""
+        """The location of batch.csv."""
         return remote.joined(self.runs, FILE_NAME)
 
     def ended(self, number: int, result: TaskResult) -> None:

@@ -81,7 +81,8 @@ def _finish(folder: Path, like: Manifest) -> Manifest:
 
 
 def _relocated(part: Reconstruction, place: Path) -> Reconstruction:
-    """With paths of the pictures relative to `place`, and a sample of the points."""
+    """The reconstruction with paths of its pictures relative to `place`, and a sample of its
+    points."""
     lead = Path(os.path.relpath(part.folder, place))
     views = tuple(
         replace(

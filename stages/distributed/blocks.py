@@ -224,8 +224,9 @@ class _BlockTraining:
     def _begin(
         self, name: str, part: Reconstruction, seeds: Splats, coarse: Splats, wide: Cell
     ) -> int:
-        """Make a block's run folder. Returns the maximum of its splats, background included: its
-        fraction of the scene's maximum is the coarse model's fraction in its cell."""
+        """Make a block's run folder. Returns the largest number of its splats, background included.
+
+        The cell gets the fraction of the scene's splats that it has of the coarse model's."""
         inside = int(wide.holds(coarse.means).sum())
         own = max(1, round(self.settings.max_splats * inside / len(coarse)))
         start = merge.initial_splats(seeds, coarse, wide, own)
@@ -298,7 +299,8 @@ class _BlockProgress(Listener):
 
 
 def _with_roles(whole: Reconstruction) -> Reconstruction:
-    """With a role for each view, so that no block trains on another block's held-out views."""
+    """The reconstruction with a role for each view, so that no block trains on another block's
+    held-out views."""
     _, held = split_held_out(whole.views)
     names = {view.name for view in held}
     if not names:

@@ -173,7 +173,8 @@ def _token(folder: Location) -> Iterator[Path | None]:
 
 
 def check(workers: Sequence[Worker], ours: str, token: Path | None = None) -> None:
-    """Raises SplatError (cluster-other-splat, cluster-folder-unseen) for unsuitable workers."""
+    """Check the workers. Raises SplatError (cluster-other-splat, cluster-folder-unseen) for those
+    that cannot take tasks."""
     for worker in workers:
         if worker.edition != ours:
             theirs = f"splat {worker.edition}" if worker.edition else "no splat"

@@ -48,7 +48,7 @@ def most_visible(
 def merge_blocks(
     parts: Sequence[Splats], cells: Sequence[Cell], draw_settings: DrawSettings
 ) -> tuple[Splats, list[int]]:
-    """(the splats of each part whose centres lie in its cell, part after part; the count of each).
+    """(the splats whose centres lie in the cell of their part, part after part; how many of each).
 
     The background of each block's training is left out. All parts have the same origin.
     """

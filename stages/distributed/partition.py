@@ -1,4 +1,4 @@
-"""The ground plane (x and z of the world) partitioned into rectangles that as many views look at.
+"""The ground plane (x and z of the world), partitioned into cells of equal weight of views.
 
 The partition depends on what the views show, not on where the cameras are, so that no block lies
 where no view looks, and a ring of cameras around an object is cut through the object. Each view
@@ -40,7 +40,7 @@ class Cell:
         return np.asarray(((ground >= self.low) & (ground < self.high)).all(1))
 
     def widened(self, by: float) -> Cell:
-        """With a border of `by` world units."""
+        """The cell, larger by `by` world units on each side."""
         low, high = np.array(self.low) - by, np.array(self.high) + by
         return Cell((float(low[0]), float(low[1])), (float(high[0]), float(high[1])))
 

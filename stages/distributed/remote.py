@@ -90,7 +90,7 @@ class RemoteFolder:
 
     @classmethod
     def at(cls, url: str) -> RemoteFolder:
-        """Raises SplatError: url-unknown, url-not-installed."""
+        """The folder at a URL. Raises SplatError: url-unknown, url-not-installed."""
         try:
             system, root = importlib.import_module("fsspec").core.url_to_fs(url)
         except ImportError as error:

@@ -88,7 +88,7 @@ class ChunkTask:
 
 @dataclass(frozen=True)
 class TaskResult:
-    """status: exit status. code, message: of the error; "" if there was none."""
+    """How a task ended. status: exit status. code, message: of the error; "" if there was none."""
 
     status: int = 0
     code: str = ""
@@ -104,7 +104,7 @@ class Resources:
 
 
 def resources_of(train: Any) -> Resources:
-    """The most that a run with these training settings needs."""
+    """The largest resources that a run with these training settings needs."""
     memory_mib = needed_mib(train.max_splats) if train.max_splats else None
     return Resources(memory_mib, gpus=int(train.backend == "gpu" or train.device == "cuda"))
 

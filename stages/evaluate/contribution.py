@@ -44,16 +44,16 @@ class Contributions:
     Args:
         sse_change: [N] change of the summed squared error if this splat alone were removed;
             negative where the views would be matched better without it.
-        picture_change: [N] summed squared change of the pictures then, whatever the views show.
+        picture_change: [N] summed squared change of the pictures by the same removal.
         weight: [N] summed blend weight.
-        kept_weight: [N] that over the pixels that no mask ignores.
+        kept_weight: [N] summed blend weight over the pixels that no mask ignores.
         view_counts: [N] views in which a pixel has a blend weight of 1/255 or more.
         sse: summed squared error of the pictures as they are.
         scene_depth: [V] median depth of each picture, world units; inf where nothing is drawn.
         truncated_sse_change: [N, L] as `sse_change`, if the colour kept only the SH coefficients up
             to degree 0..L - 1 and the mean of what is lost were added to its DC.
         truncated_picture_change: [N, L] as `picture_change`, for the same truncation.
-        truncated_colour: [N, L, 3] that mean: what is added to the colour.
+        truncated_colour: [N, L, 3] the mean that is added to the colour.
         psnr_db: [V] PSNR of each picture.
         sh_sums: the sums that the truncated figures come from, so that more views can be added.
         previous: the contributions that this measurement started from. They are included in all
@@ -277,7 +277,7 @@ def colours_by_degree(splats: Splats, centre: NDArray[np.floating]) -> NDArray[n
 
 
 def squared_error(splats: Splats, views: Iterable[EvaluationView], backend: str) -> float:
-    """Summed over pixels and channels of all views, as `Contributions.sse`."""
+    """The squared error of the pictures, summed over pixels and channels of all views."""
     draw, found = image_renderer(splats, backend), 0.0
     for view in views:
         squares = np.square(draw(view.camera) - view.image, dtype=np.float64)
@@ -288,8 +288,8 @@ def squared_error(splats: Splats, views: Iterable[EvaluationView], backend: str)
 def near_view_frusta(
     splats: Splats, cameras: Iterable[Camera], margin: float = MARGIN
 ) -> NDArray[np.bool_]:
-    """[N] splats that project into a picture or just beyond its edge, where new views look: by at
-    most `margin` of its longer side."""
+    """[N] splats that project into a picture or beyond its edge by at most `margin` of its longer
+    side, where new views look."""
     near = np.zeros(len(splats), bool)
     for camera in cameras:
         pixels, z = camera.project(splats.means)

@@ -60,7 +60,7 @@ class Patches:
 
     @property
     def counts(self) -> NDArray[np.intp]:
-        """[M] views that see each."""
+        """[M] the number of views that see each patch."""
         return np.asarray(self.seen.sum(axis=1))
 
     @property
@@ -124,7 +124,7 @@ def _patches(
 def weighted_quantile(
     points: NDArray[np.float64], weights: NDArray[np.floating], share: float
 ) -> NDArray[np.float64]:
-    """[3] for each coordinate."""
+    """[3] the quantile of each coordinate."""
     found = np.quantile(points, share, axis=0, weights=weights, method="inverted_cdf")
     return np.asarray(found)
 
@@ -162,11 +162,11 @@ class CameraLayout:
     distance: float
 
     def elevations_deg(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Above the horizon, of [..., 3]."""
+        """Angles of the directions [..., 3] above the horizon."""
         return np.asarray(np.degrees(np.arcsin(np.clip(directions @ self.up, -1.0, 1.0))))
 
     def azimuths_deg(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """On the map, clockwise from its top, of [..., 3]; from -180 to 180."""
+        """Angles of directions [..., 3] on the map, clockwise from its top; from -180 to 180."""
         right, ahead = self.map_axes
         return np.asarray(np.degrees(np.arctan2(directions @ right, directions @ ahead)))
 
@@ -270,9 +270,11 @@ def _blocked(layout: CameraLayout, patches: Patches, direction: NDArray[np.float
 def _walls(
     patches: Patches, eyes: NDArray[np.float64]
 ) -> Iterator[tuple[NDArray[np.float64], float]]:
-    """(normal [3] towards the cameras, offset) of planes that hold much of the area, that hide
-    nearly none of it, and that all cameras, with centres `eyes` [V, 3], are before. Planes through
-    three random patches are tried (RANSAC)."""
+    """(normal [3] towards the cameras, offset) of planes that are walls.
+
+    A wall holds much of the area and hides nearly none of it, and all cameras, with centres `eyes`
+    [V, 3], are in front of it. Planes through three random patches are tried (RANSAC).
+    """
     total = patches.area / max(patches.area.sum(), 1e-12)
     share = total
     for number in range(_WALLS):
@@ -350,8 +352,8 @@ def _connected(centres: NDArray[np.float64], side: float) -> list[NDArray[np.int
 
 
 def _move(splats: Splats, region: PoorRegion, camera: Camera, backend: str) -> str:
-    """The first move, by twice the smallest sufficient angle, from which the region is not
-    occluded."""
+    """The first of the moves after which the region is not occluded; each is by twice the smallest
+    sufficient angle."""
     offset, side = float(np.linalg.norm(region.centre - camera.centre)), _PROBE_PX
     length = offset * np.tan(np.radians(2 * MIN_ANGLE_DEG))
     right, down = camera.world_to_camera[0, :3], camera.world_to_camera[1, :3]

@@ -77,7 +77,7 @@ class EvaluationView:
 
     def scaled(self, scale: float) -> EvaluationView:
         """At `scale` (at most 1) times the size along each side, by area averaging as in
-        `scene.pictures`. A pixel is compared if all that it averages is."""
+        `scene.pictures`. A pixel is compared if all pixels that it averages are."""
         if scale == 1:
             return self
         camera = self.camera.resized(
@@ -159,7 +159,7 @@ class _EvaluationViews(Sequence[EvaluationView]):
 def load_evaluation_views(
     folder: Path, views: Iterable[View], draw_settings: DrawSettings, stop: Event | None = None
 ) -> Sequence[EvaluationView]:
-    """The views with their photographs at the size of `look`, over its background and in its light.
+    """The views with their photographs, at the size, background and light of `draw_settings`.
 
     As many as fit into `IN_MEMORY_MIB` are read at once. Raises SplatError, now or when a view is
     used, and Interrupted when `stop` is set.

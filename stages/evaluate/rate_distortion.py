@@ -27,8 +27,8 @@ class RateDistortion:
 
     Args:
         samples: colour samples of the photographs.
-        independent_samples: as many independent samples hold the same information; residuals of
-            neighbouring pixels are correlated.
+        independent_samples: the number of independent samples that hold the same information;
+            residuals of neighbouring pixels are correlated.
         sse: summed squared error of the present drawings.
     """
 
@@ -37,7 +37,7 @@ class RateDistortion:
     sse: float
 
     def scaled(self, times: float) -> RateDistortion:
-        """For `times` as many photographs like these."""
+        """The exchange rate for `times` as many photographs like these."""
         return RateDistortion(
             round(self.samples * times), self.independent_samples * times, self.sse * times
         )
@@ -74,7 +74,7 @@ def rate_distortion_of(draw: ImageRenderer, views: Iterable[EvaluationView]) -> 
 
 
 def _tiles(residual: NDArray[np.floating]) -> NDArray[np.float32]:
-    """[T, S, S, 3] the whole tiles of a residual [H, W, 3]; S is smaller where the picture is."""
+    """[T, S, S, 3] whole tiles of a residual [H, W, 3]; S is at most the size of the picture."""
     side = min(_TILE, *residual.shape[:2])
     high, wide = (length // side for length in residual.shape[:2])
     whole = residual[: high * side, : wide * side].reshape(high, side, wide, side, 3)
@@ -82,8 +82,8 @@ def _tiles(residual: NDArray[np.floating]) -> NDArray[np.float32]:
 
 
 def independent_share(residuals: Sequence[NDArray[np.floating]]) -> float:
-    """The effective sample size, as a share of the samples: as many independent samples would
-    estimate the mean square equally well.
+    """The effective sample size, as a share of the samples: the number of independent samples that
+    would estimate the mean square equally well.
 
     It is 1 / the sum of squared correlations of a sample with all others, read off the mean power
     spectrum of the tiles, with colours along axes on which they are not correlated.

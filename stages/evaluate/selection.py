@@ -46,7 +46,7 @@ class Removal:
     predicted_sse: float
 
     def apply(self, splats: Splats) -> Splats:
-        """What is left of them."""
+        """The splats that remain, with the SH degrees and colours that they keep."""
         kept = own_coefficients(self.degrees, splats.sh.shape[1])
         sh = np.where(kept, splats.sh, splats.sh.dtype.type(0))
         sh[:, 0] += (self.colour / SH_C0).astype(sh.dtype)

@@ -75,8 +75,8 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     report.metric("finetune_steps", pruner.finetuner.steps)
     _report_result(splats, found, report)
     report.metric("summary", summarise(trained, found, settings.strength, pruner.finetuner.steps))
-    asked_for = found.forced or settings.min_psnr > 0
-    if pruner.targets.broken_by(loss_db) and not asked_for:
+    requested = found.forced or settings.min_psnr > 0
+    if pruner.targets.broken_by(loss_db) and not requested:
         report.warn("prune-loss-above-limit", describe_loss(loss_db, pruner.targets))
     if advice := advise_more_splats(found, settings.strength):
         report.warn("prune-more-would-pay", advice)

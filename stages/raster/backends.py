@@ -97,7 +97,8 @@ CHOICES = (AUTO, *(backend.name for backend in BACKENDS))
 
 
 def backend_of(name: str) -> Backend:
-    """The backend of that name, or the one that "auto" takes. Raises ValueError for another."""
+    """The backend of that name, or the one that "auto" takes. Raises ValueError for an unknown
+    name."""
     base_name, _, device = name.partition(_DEVICE_MARK)
     for backend in BACKENDS:
         if backend.name == base_name or (base_name == AUTO and not backend.why_unavailable()):

@@ -30,7 +30,7 @@ def clamp_limits(camera: Camera) -> tuple[float, float, float, float]:
 
 
 def camera_row(camera: Camera, settings: RasterSettings) -> NDArray[np.float64]:
-    """[28] as named above."""
+    """[28] numbers of a camera and its settings, at the indices that the comments above name."""
     return np.concatenate(
         [
             camera.world_to_camera[:3, :3].ravel(),

@@ -24,7 +24,7 @@ _OUTSIDE = 1e-3  # weight of a camera whose picture does not hold the mean of a 
 
 
 def without_compensation(splats: Splats, cameras: Sequence[Camera]) -> Splats:
-    """`splats`, which are trained to be drawn with compensation, for plain drawing.
+    """Splats for plain drawing, made of `splats` that are trained for drawing with compensation.
 
     cameras: in the world of the splats, at the size of training.
     """
@@ -40,7 +40,7 @@ def without_compensation(splats: Splats, cameras: Sequence[Camera]) -> Splats:
 
 def mean_compensation(splats: Splats, cameras: Sequence[Camera]) -> NDArray[np.float64]:
     """[N] factor of each splat's opacity, averaged over the cameras whose picture holds its mean;
-    over the cameras in front of which it lies if there is none; 1 if there is none either."""
+    if there is no such camera, over those that the splat is in front of; 1 if no camera is left."""
     from stages.raster.reference import parameters_of, project  # it loads torch
 
     opaque = replace(splats, opacity_logits=np.full(len(splats), _OPAQUE, np.float32))

@@ -46,7 +46,7 @@ def used_columns(coefficients: int) -> int:
 
 
 def gradient_columns(coefficients: int) -> int:
-    """All columns of such a row: whole vectors."""
+    """Columns of a gradient row, in use or not: a whole number of vectors."""
     return -(-used_columns(coefficients) // 16) * 16
 
 
@@ -146,7 +146,7 @@ class Backward:
 
 
 def with_smoothing(arrays: Arrays) -> Arrays:
-    """The six arrays; the last is NO_SMOOTHING where there are five."""
+    """The arrays of splats and the widths of the smoothing filter, NO_SMOOTHING if not given."""
     return (*arrays, NO_SMOOTHING)[:6]
 
 
@@ -174,5 +174,6 @@ class Rasteriser(Protocol):
         """Gradients of the visible splats from v_image [3, H, W], the gradient of the image."""
 
     def contributions(self, forward: Any, residual: NDArray[np.float32]) -> NDArray[np.float64]:
-        """[V, CONTRIBUTIONS] of the visible splats; columns as above. residual [3, H, W]:
+        """Contributions [V, CONTRIBUTIONS] of the visible splats, in the columns that the constants
+        above name. residual [3, H, W]:
         render - photograph."""

@@ -52,8 +52,10 @@ def rendering_of(forward: Forward) -> Rendering:
 
 
 def supersampled(draw: Callable[[Camera], Rendering], side: int) -> Callable[[Camera], Rendering]:
-    """A function that draws as `draw` does, but pictures whose longer side is below `side` pixels
-    a whole number of times as large, and averages colour and alpha over each pixel's area.
+    """A function that draws as `draw` does, with smooth small pictures.
+
+    A picture whose longer side is below `side` pixels is drawn larger, by a whole number, and its
+    colour and alpha are averaged over the area of each pixel.
 
     A splat of a fraction of a pixel is too faint and too wide in a direct drawing: the low-pass
     filter widens it, and compensation treats it alone, not with the neighbours that fill the pixel.
@@ -84,7 +86,8 @@ def supersampled(draw: Callable[[Camera], Rendering], side: int) -> Callable[[Ca
 
 
 def raster_settings_of(splats: Splats) -> RasterSettings:
-    """By the draw settings of `splats`; without a near plane there, by the extent of the splats."""
+    """The rasteriser's settings by the draw settings of `splats`. If these have no near plane, it
+    comes from the extent of the splats."""
     drawn = splats.draw_settings
     near = drawn.near or near_plane_of(splats.means)
     return RasterSettings(near, antialias=drawn.antialias, background=(drawn.background,) * 3)

@@ -214,14 +214,14 @@ def _light_before(alpha: Tensor) -> Tensor:
 
 
 def weights_of(alpha: Tensor) -> tuple[Tensor, Tensor]:
-    """([M, P] blend weights, [P] light that still passes) of alphas, nearest first."""
+    """([M, P] blend weights, [P] transmittance that is left) of alphas, nearest first."""
     return alpha * _light_before(alpha), (1 - alpha).prod(0)
 
 
 def blend_weights(
     projected: Projected, rows: Tensor, pixels: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """([M, P] blend weights, [P] light that still passes, [P] median depth) of splats `rows` at
+    """([M, P] blend weights, [P] transmittance that is left, [P] median depth) of splats `rows` at
     pixel centres [P, 2]."""
     alpha = alphas_at(projected, rows, pixels)
     weights, passed = weights_of(alpha)
@@ -240,7 +240,7 @@ def render_tensors(
 def render_projected(
     p: Parameters, projected: Projected, camera: Camera, settings: RasterSettings
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """As `render_tensors`, from given footprints."""
+    """The result of `render_tensors`, from given footprints."""
     like: dict[str, Any] = {"dtype": p.means.dtype, "device": p.means.device}
     centre = torch.tensor(camera.centre, **like)
     rgb = colours(p.rows(projected.index), centre, settings.sh_degree)

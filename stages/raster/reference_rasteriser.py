@@ -46,7 +46,7 @@ _LARGEST = float(np.finfo(np.float32).max)
 
 @dataclass(frozen=True)
 class ReferenceForward:
-    """As `definition.Forward`, and the inputs, to draw again with gradients."""
+    """A `definition.Forward` that also keeps the inputs, to draw again with gradients."""
 
     image: NDArray[np.float32]
     visible: NDArray[np.int32]

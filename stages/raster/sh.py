@@ -1,5 +1,4 @@
-"""Real spherical harmonics to degree 3, as tables of numbers for every backend, and which of them
-a splat has.
+"""Real spherical harmonics to degree 3, as tables of numbers for every backend.
 
 Order and signs are the reference trainer's (Kerbl et al. 2023): degree by degree, m = -l..l, with
 the Condon-Shortley sign, for a unit direction (x, y, z) from the camera to the splat.

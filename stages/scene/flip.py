@@ -40,7 +40,9 @@ def flipped(splats: Splats, *, reuse: bool = False) -> Splats:
     arrays = {}
     for name, sign in signs.items():
         values = getattr(splats, name)
-        with np.errstate(invalid="ignore"):  # a damaged file's NaN; `checked` refuses it
+        with np.errstate(
+            invalid="ignore"
+        ):  # a damaged file's NaN; `values.check_finite` refuses it
             arrays[name] = np.multiply(values, sign, out=values if reuse else None)
     # + 0.0: an origin of -0 would be written as such
     origin, place = splats.origin * FLIP + 0.0, flipped_place(splats.place)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from stages.base.blocks import reported_blocks
+from stages.base.blocks import blocks
 from stages.scene.rotations import quaternions_of
 
 NEIGHBOURS = 16
@@ -24,7 +24,7 @@ def surface_axes(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDAr
     splats at `points` [N, 3], which are finite. The first axis is the normal."""
     count = min(NEIGHBOURS + 1, len(points))
     tree, turns = cKDTree(points), np.empty((len(points), 4))
-    for rows in reported_blocks(len(points)):
+    for rows in blocks(len(points)):
         near = points[np.reshape(tree.query(points[rows], count)[1], (-1, count))]
         spread = near - near.mean(axis=1, keepdims=True)
         axes = np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread))[1]  # smallest first

@@ -233,8 +233,8 @@ class Model:
     trained. moment1, moment2: columns as the gradient's, for all coefficients.
     steps [N, STEP_COUNTS] int32: numbers of steps, by groups of columns. gradient_sum,
     gradient_count [N]: since the last densification. smoothing [N]: widths of the 3D smoothing
-    filter, 0 for none. distances [N]: to the nearest camera, in extents of the scene: how far a
-    mean moves to move as far in a picture; see `camera_distances`.
+    filter, 0 for none. distances [N]: to the nearest camera, in extents of the scene; they
+    scale the steps of means, so that these are alike in a picture; see `camera_distances`.
     """
 
     means: NDArray[np.float32]

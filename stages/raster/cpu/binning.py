@@ -115,7 +115,8 @@ def _order_ties(
 
 
 def _in_runs(same: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """[n + 1] whether an element equals a neighbour; same [n]: each and the next."""
+    """[n + 1] whether an element equals the one before or after it. same [n]: whether an element
+    equals the next."""
     return np.asarray(np.append(same, False) | np.append(False, same))
 
 

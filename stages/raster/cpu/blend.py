@@ -84,7 +84,7 @@ _LANES, _STEPS = _offsets()
 
 @kernel
 def tile_frame(geometry, row, tile_x, tile_y):
-    """The record of a row around the tile's first pixel centre.
+    """The exponent of the splat `row` in coordinates around the tile's first pixel centre.
 
     Returns (major, A, B, -K, log2 opacity, U, T): major, 0 where the major axis is x, 16 where it
     is y; U, T: vectors of the first block's offsets along the major axis and across it.
@@ -117,7 +117,7 @@ def _first_block(u, t, k, major):
 
 @kernel
 def _sums_frame(geometry, row, tile_x, tile_y, width, height):
-    """As U and T of `tile_frame`, from where the sums begin."""
+    """The U and T of `tile_frame`, relative to the origin of the sums (`sums_origin`)."""
     o, p, q = sums_origin(geometry, row, width, height)
     x, y, k = tile_x * TILE + 0.5, tile_y * TILE + 0.5, geometry[row, GK]
     wide = geometry[row, GVX] >= geometry[row, GVY]
@@ -127,8 +127,10 @@ def _sums_frame(geometry, row, tile_x, tile_y, width, height):
 
 @kernel
 def alpha_of(frame, block):
-    """Of the 16 pixels of a block: alpha before the cap, and the differences between the offsets of
-    this block and of the first, along and across."""
+    """(alpha before the cap, offsets along, offsets across) of the 16 pixels of a block.
+
+    Offsets are relative to those of the first block.
+    """
     major, a, b, slope, level, us, ts = frame
     along = splat16(_STEPS[major + block])
     across = vfma(slope, along, splat16(_STEPS[16 - major + block]))

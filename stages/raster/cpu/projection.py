@@ -137,8 +137,9 @@ def footprint(rows, cam, means, quaternions, log_scales, opacity_logits, smoothi
 
 @kernel
 def _scales(rows, log_scales, smoothing, w):
-    """Scales, widened by the smoothing filter f to sqrt(s^2 + f^2), and what that takes from the
-    opacity: the product of s / sqrt(s^2 + f^2) over the axes. No square under- or overflows."""
+    """Scales, widened by the smoothing filter f to sqrt(s^2 + f^2), and the factor by which that
+    lowers the opacity: the product of s / sqrt(s^2 + f^2) over the axes. No square under- or
+    overflows."""
     factor = spread8(1.0)
     for k in range(3):
         s = dexp(gather8(log_scales, rows, 3, k))
@@ -218,13 +219,14 @@ def _axes(rows, cam, quaternions, w):
 
 @kernel
 def used_opacity(w):
-    """Opacity as it is drawn: with what antialiasing and smoothing make of it."""
+    """Opacity as it is drawn: lowered by antialiasing and smoothing."""
     return at(w, FULL_OPACITY) * at(w, COMPENSATION) * at(w, SMOOTHING)
 
 
 @kernel
 def geometry_records(cam, w, rows, geometry):
-    """geometry[rows] from their work; the mask of those that touch a pixel of the picture."""
+    """Write geometry[rows] from their work `w`; return the mask of rows that touch a pixel of the
+    picture."""
     opacity = used_opacity(w)
     a, b, c, det, z = at(w, A), at(w, B), at(w, C), at(w, DET), at(w, Z)
     drawn = dand(dge(opacity, ALPHA_MIN), dand(dgt(1e300, det), dgt(det, 0.0)))

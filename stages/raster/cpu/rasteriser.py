@@ -208,7 +208,7 @@ def _starts(counts: NDArray[np.int32], starts: NDArray[np.int32]) -> int:
 def _lists_too_large(
     error: MemoryError, camera: Camera, log_scales: NDArray[np.floating]
 ) -> SplatError:
-    """log_scales: of the visible splats."""
+    """The error for lists that memory cannot hold. log_scales: of the visible splats."""
     given = f"The lists of {len(log_scales):,} splats for {camera.width} x {camera.height} pixels"
     linear = bool((log_scales >= 0).all())  # lengths are, and logarithms of small lengths are not
     return ResourceError(

@@ -79,7 +79,7 @@ def _colours_are_finite(i, sh):
 
 @kernel
 def _block_of_colours_is_finite(start, sh):
-    """Whether eight rows from `start` have finite colours only; 0 x value is 0 for these."""
+    """Whether eight rows from `start` have finite colours only; 0 x value is 0 if it is finite."""
     size = sh.shape[1] * 3
     nothing = spread8(0.0)
     for k in range(size):

@@ -97,8 +97,9 @@ def blend_kernel(
 ):
     """Draw a tile. image [4 or 6, H, W]: colour, alpha, and if DEPTHS expected and median depth.
 
-    light, last [H, W]: what passes at the end; the number of the last entry drawn, or NEVER.
-    members: rows of the splats, tile by tile, from starts[tile]. red, green, blue: background.
+    light [H, W]: the transmittance that is left. last [H, W]: the number of the last entry drawn,
+    or NEVER. members: rows of the splats, tile by tile, from starts[tile]. red, green, blue:
+    background.
     """
     x, y, i, j, at, inside = pixels_of(tl.program_id(0), tiles_x, width, height, TILE)
     passing = tl.where(inside, 1.0, 0.0)

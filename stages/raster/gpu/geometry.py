@@ -1,8 +1,8 @@
 """Footprints of splats: what the forward and the backward pass both compute.
 
-Formulas as in `reference`, a splat a lane. REAL is the type that all of it runs in: float64 unless
-a test asks what float32 would leave of the extremes table. A row of parameters has the columns of a
-row of gradients (`definition`).
+Formulas as in `reference`, one splat in each lane. REAL is the type of all numbers: float64, or
+float32 in a test that measures what it costs. A row of parameters has the columns of a row of
+gradients (`definition`).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Functions that kernels call.
 
-Triton compiles them as it does kernels. Its interpreter would set itself up anew at each call,
-which takes longer than what they do: there they are plain functions.
+Triton compiles them as it does kernels. Its interpreter sets itself up at each call of what it
+interprets, which takes longer than these functions do: there they are Python functions.
 """
 
 from __future__ import annotations

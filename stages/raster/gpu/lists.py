@@ -134,7 +134,7 @@ def entries_kernel(
 
 @inner
 def compared(rows, a, b, mask, k, sign, COLUMNS: tl.constexpr):
-    """`sign`, or where that is 0 that of column k of rows a less that of rows b."""
+    """`sign`; where that is 0, the sign of column k of rows a minus column k of rows b."""
     x = tl.load(rows + a * COLUMNS + k, mask=mask, other=0.0)
     y = tl.load(rows + b * COLUMNS + k, mask=mask, other=0.0)
     here = (x > y).to(tl.int32) - (x < y).to(tl.int32)

@@ -90,7 +90,7 @@ class Drawn:
 
 @dataclass(frozen=True)
 class Forward:
-    """As `definition.Forward`, with what the backward pass needs."""
+    """A `definition.Forward` with what the backward pass needs."""
 
     image: NDArray[np.float32]
     visible: NDArray[np.int32]

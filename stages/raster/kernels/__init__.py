@@ -1,4 +1,8 @@
-"""Support for compiled kernels: vector types, threads, and the cache of compiled code."""
+"""Support for compiled kernels: vector types, threads, and the cache of compiled code.
+
+`pool` runs kernels in threads, `cache` keeps compiled ones, `simd` and `simd64` are the vectors
+that they compute with, which `vectors` defines.
+"""
 
 from stages.raster.kernels import cache
 

@@ -1,7 +1,7 @@
 """A pool of threads for kernels that release the GIL.
 
-Plain threads instead of OpenMP: they do not spin while they wait, do not compete with torch's pool,
-and need no library. Work is shared through a counter (`take_ticket`), so that a thread that lost
+Unlike OpenMP's, these threads do not spin while they wait, do not compete with torch's pool, and
+need no library. Work is shared through a counter (`take_ticket`), so that a thread that lost
 its core to another process does not delay the others.
 """
 
@@ -34,7 +34,7 @@ class Pool:
         *args: Any,
         beside: Callable[[], Any] | None = None,
     ) -> None:
-        """Call kernel(counter, *args) in every thread; the kernel takes tickets from `counter`.
+        """Call kernel(counter, *args) in every thread; see `take_ticket` for the counter.
 
         beside: a function that the calling thread runs first, while the others begin.
         """

@@ -82,7 +82,7 @@ class GpuTarget:
     """A training view on a device.
 
     Args:
-        level: the view; kept because `gpu_step` identifies views by its means.
+        level: the view; kept because `GpuStep` identifies views by its means.
         pixels: [3, H, W] bytes, or float32 if the light is corrected or the view is cut out.
         means: [3] of the channels.
         uncovered: [H, W] how much of the background shows in a cut-out view.
