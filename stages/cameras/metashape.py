@@ -11,24 +11,22 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import CAMERAS, BadFileError, reading
-from stages.base.text import reason_of
 from stages.cameras.camera_file import (
     NO_GEOREFERENCE,
     ROTATION_TOLERANCE,
     CameraFile,
     Georeference,
     camera_file,
-    content_of,
     poses_of,
 )
 from stages.cameras.lens import Lens
+from stages.cameras.xml_file import parsed
 from stages.scene.place import GEOGRAPHIC, EarthPlace, east_north_up, geodetic
 
 _EARTH_RADII = (6.2e6, 6.5e6)  # metres, of places where photographs are taken
@@ -39,7 +37,7 @@ _KINDS = {"frame": "perspective", "fisheye": "fisheye"}
 def read(path: Path) -> CameraFile:
     """The cameras that were aligned. Raises SplatError "cameras-unreadable"."""
     with reading(path, CAMERAS):
-        root = _parsed(path)
+        root = parsed(path)
         optics = {
             sensor.get("id", ""): _optics(sensor)
             for sensor in root.iter("sensor")
@@ -111,15 +109,3 @@ def _optics(sensor: Element) -> tuple[list[float], Lens]:
     skew = value("b2") / across if across > 0 else 0.0
     lens = Lens(_KINDS[kind], (k1, k2, k3, k4), tangential=(p2, p1), skew=skew)
     return numbers + centre, lens
-
-
-def _parsed(path: Path) -> Element:
-    """The root element. Raises BadFileError, also for entities, which may expand to gigabytes."""
-    data = content_of(path)
-    ascii_part = data.replace(b"\0", b"")  # of UTF-16 too, in either byte order
-    if b"<!DOCTYPE" in ascii_part or b"<!ENTITY" in ascii_part:
-        raise BadFileError("it declares entities, which no such file needs")
-    try:
-        return ElementTree.fromstring(data)
-    except ElementTree.ParseError as error:
-        raise BadFileError(f"it is damaged ({reason_of(error)})") from error

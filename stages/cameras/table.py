@@ -27,7 +27,9 @@ from stages.cameras import (
     metashape,
     nerfstudio,
     opensfm,
+    opf,
     realityscan,
+    realityscan_xmp,
 )
 from stages.cameras.camera_file import CameraFile, FilePoints
 
@@ -78,8 +80,13 @@ CAMERA_FILES = (
     CameraFormat("Bundler's .out", _suffixed(".out"), bundler.read, bundler.read_points),
     CameraFormat("Metashape's cameras as .xml", _suffixed(".xml"), metashape.read),
     CameraFormat("RealityScan's camera parameters as .csv", _suffixed(".csv"), realityscan.read),
+    CameraFormat(
+        "a folder with RealityScan's .xmp beside the photographs",
+        *(realityscan_xmp.locate, realityscan_xmp.read),
+    ),
+    CameraFormat("Pix4D's project.opf", opf.locate, opf.read, files=opf.files),
 )
-_READ_TOGETHER = (".json", ".bin", ".txt", ".npy", ".ply")  # in a folder of cameras
+_READ_TOGETHER = (".json", ".bin", ".txt", ".npy", ".ply", ".xmp")  # in a folder of cameras
 
 
 def read_cameras(path: Path) -> CameraFile:

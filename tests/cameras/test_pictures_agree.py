@@ -123,6 +123,9 @@ def _cut(path: Path) -> None:
         ("metashape", "cameras.xml"),
         ("realityscan", "cameras.csv"),
         ("arkit", "frame_00006.json"),
+        ("realityscan_xmp", "p_2.xmp"),
+        ("opf", "project.opf"),
+        ("opf", "calibrated-cameras.json"),
     ],
 )
 def test_half_a_file_is_refused_in_words(tmp_path: Path, name: str, file: str) -> None:

@@ -21,7 +21,9 @@ from stages.cameras import (
     metashape,
     nerfstudio,
     opensfm,
+    opf,
     realityscan,
+    realityscan_xmp,
 )
 from stages.scene import Camera, View
 from tests.cameras.drawn_surveys import MADE, NAMES
@@ -177,6 +179,12 @@ LAYERS = {
     "Bundler bundle.out": _other(bundler, "bundle.out"),
     "Bundler list.txt": replace(_other(bundler, "list.txt"), read=_bundle_of_list),
     "ARKit frame_00006.json": _other(arkit, "frame_00006.json", source="."),
+    "RealityScan .xmp": _other(realityscan_xmp, "p_1.xmp", source="."),
+    "OPF project.opf": _other(opf, "project.opf"),
+    **{
+        f"OPF {part}.json": _other(opf, f"{part}.json", source="project.opf")
+        for part in ("calibrated-cameras", "input-cameras", "scene-reference-frame")
+    },
     "transforms.json": Layer(
         "transforms.json",
         _content("json", "transforms.json"),
