@@ -2,6 +2,6 @@
 
 In reading order: `camera_file` (what every reader returns), `table` (the formats, and how to add
 one), `lens` and `undistortion` (camera models), then the formats: `colmap` with `colmap_records`,
-`nerfstudio`, `blender`, `llff`, `opensfm`, `odm_shots`, `bundler`, `metashape`, `realityscan`,
+`nerfstudio`, `blender`, `llff`, `opensfm`, `bundler`, `metashape`, `realityscan`,
 `realityscan_xmp`, `opf`, `arkit`.
 """

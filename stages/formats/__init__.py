@@ -13,7 +13,7 @@ To add a format, in six steps:
    `verify`, `info` and their help, the fuzzer and the tests of all formats are driven by the table.
 4. Write an independent reader (of a library, or of raw bytes) in `stages.proof`, and add its row
    to `stages.proof.checks.CHECKS`.
-5. Say in `tests.docs_tables.FORMAT_CELLS` what the format opens in and keeps, and run
+5. Say in the tables of `tests/docs_tables.py` what the format opens in and keeps, and run
    `python -m tests.docs_tables`, which writes the tables of the documentation.
 6. Run `pytest tests/formats tests/proof tests/fuzz`.
 """

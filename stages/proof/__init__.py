@@ -2,6 +2,6 @@
 
 `prover` proves a file by the row of its format in `checks`: an independent reader
 (`independent_readers`, `independent_packed`) gives its `content`, `matching` finds the same splats
-in both, `compare` measures the differences, and `diagnosis` names the likely error of the writer.
-`statistics` and `byte_breakdown` are what `splat info` prints.
+in both, and `compare` measures the differences; `losses` says which of them are seen, and
+`usd_validation` asks USD's own validators. `statistics` is what `splat info` prints.
 """

@@ -5,6 +5,5 @@
 `density`, `sparsification`, `colour_refit`, evaluation (`history`), `time_limit`, `checkpoint`. A
 step trains on one of the `views`, in `steps`, by `loss` and `optimiser`, perhaps with `dropout` or
 `camera_refinement`. Around it: `conversion`, `album`, `cap`, `clock`. At the end: `quality`,
-`charts`. `finetune` trains finished splats further for later stages. `compile_kernels` compiles
-before training.
+`charts`. `finetune` trains finished splats further for later stages.
 """
