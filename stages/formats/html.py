@@ -57,7 +57,7 @@ def write_beside(
         content: the asset's lod-meta.json; the page lies beside it.
         splats: the finest level, to place the cameras.
         units, views: as for `write`.
-        widths: width of the splats of each level, see `streamed_sog.widths`.
+        widths: width of the splats of each level, see `streamed_sog.splat_widths`.
 
     Raises SplatError when the file cannot be written.
     """
