@@ -21,7 +21,6 @@ from stages.base.errors import Family
 from stages.base.libraries import modules_of, needed, versions
 from stages.base.memory import available_mib
 from stages.base.text import counted, reason_of
-from stages.cameras.table import CAMERA_FILES
 from stages.ingest.decode import FORMATS, readers_set_up
 from stages.raster.backends import AUTO, BACKENDS, Backend, backend_of
 from stages.raster.gpu import device
@@ -70,7 +69,6 @@ def checks() -> Iterator[Check]:
     yield _attempted("GPU", _gpu, needed=False)
     yield _attempted("photographs read", _photograph_formats)
     yield _attempted("videos read", _video_codecs)
-    yield _attempted("cameras read", _camera_files)
     for backend in BACKENDS:
         yield _backend(backend)
     yield Check("--backend auto", backend_of(AUTO).name)
@@ -135,10 +133,6 @@ def _video_codecs() -> str:
     import av
 
     return ", ".join(name for name in _VIDEO_CODECS if name in av.codecs_available)
-
-
-def _camera_files() -> str:
-    return ", ".join(row.description for row in CAMERA_FILES)
 
 
 def _backend(backend: Backend) -> Check:

@@ -33,7 +33,6 @@ def write_plots(folder: Path, tradeoff: Tradeoff) -> list[Path]:
         "formats": _formats(tradeoff),
         "splats": _splats(tradeoff),
         "drawing": _drawing(tradeoff),
-        "photographs": _photographs(tradeoff),
     }
     if tradeoff.coverage.layout is not None:
         figures["coverage"] = _coverage_maps(tradeoff.coverage)
@@ -133,21 +132,6 @@ def _with_bars(
         axes.errorbar(
             [x], [point.psnr_db], yerr=bars, fmt=mark, color=colour, ms=5, elinewidth=1, capsize=3
         )
-
-
-def _photographs(tradeoff: Tradeoff) -> Figure:
-    """By number: the plot's font may lack the letters of a name."""
-    from matplotlib.ticker import MaxNLocator
-
-    figure, axes = new_plot("Each held-out view", "number of the photograph", _PSNR)
-    numbers = range(1, len(tradeoff.scores) + 1)
-    axes.plot(numbers, [s.psnr_db for s in tradeoff.scores], "o", color=BLUE, label="photograph")
-    worst, no = tradeoff.worst, tradeoff.scores.index(tradeoff.worst) + 1
-    axes.plot([no], [worst.psnr_db], "o", color=ORANGE, label=f"worst: no. {no}")
-    axes.axhline(tradeoff.own.psnr_db, color=GREY, linewidth=0.8, linestyle=":", label="mean")
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.legend()
-    return figure
 
 
 def _logarithmic(axes: Axes) -> None:
