@@ -12,8 +12,7 @@ import textwrap
 from html import escape
 from pathlib import Path
 
-from tests.layers import LAYERS, STAGES
-from tests.test_layers import MODULES, imports_of, package_of
+from tests.layers import LAYERS, MODULES, STAGES, imports_of, package_of
 
 ROOT = Path(__file__).parent.parent
 PICTURE = ROOT / "docs" / "packages.svg"

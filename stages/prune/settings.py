@@ -70,7 +70,7 @@ class PruneSettings:
 
 STAGE = Stage(
     "prune",
-    version=22,
+    version=23,
     reads=("sfm", "train"),
     settings_type=PruneSettings,
     **in_module("stages.prune.stage"),

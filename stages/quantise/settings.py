@@ -67,7 +67,7 @@ class QuantiseSettings:
 
 STAGE = Stage(
     "quantise",
-    version=13,
+    version=14,
     reads=("sfm", "train", "prune"),
     settings_type=QuantiseSettings,
     **in_module("stages.quantise.stage"),

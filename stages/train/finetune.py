@@ -24,7 +24,7 @@ from stages.scene import IGNORE, Splats
 from stages.train.colour_refit import ColourRefit, needs_colour_refit
 from stages.train.conversion import model_of
 from stages.train.dropout import Dropout
-from stages.train.optimiser import LearningRates, Model
+from stages.train.optimiser import LearningRates, Model, camera_distances
 from stages.train.steps.step import StepInput, step_of
 from stages.train.views import Level
 
@@ -83,6 +83,7 @@ class FineTuner:
             return splats
         model = model_of(splats)
         model.sh_degrees[:], model.gradient_count[:] = splats.sh_degrees, view_counts
+        model.distances[:] = camera_distances(model.means, self.cameras, self.extent)
         self._stepper.load(model)
         settings = replace(raster_settings_of(splats), sh_degree=splats.sh_degree)
         for number in range(steps):
