@@ -19,12 +19,13 @@ from stages.run.pipeline import Pipeline
 from stages.run.runfile import RunFile
 from stages.scene import Reconstruction, Splats, save_splats
 from stages.sfm.reconstruction_files import save_reconstruction
+from stages.train.settings import TrainSettings
 
 _POINTS = 100_000  # at most, of the sparse cloud, which only tells the extent of the scene
 
 
 def begin(
-    whole: Pipeline, folder: Path, part: Reconstruction, start: Splats, settings: Any
+    whole: Pipeline, folder: Path, part: Reconstruction, start: Splats, settings: TrainSettings
 ) -> None:
     """Make `folder` a run folder in which ingest, sfm and seed have finished. Equal inputs give
     equal folders, so that this can be repeated.

@@ -45,6 +45,7 @@ from stages.train.dropout import uses_dropout
 from stages.train.finetune import FineTuner
 from stages.train.history import History
 from stages.train.quality import write_history, write_quality
+from stages.train.settings import TrainSettings
 from stages.train.stage import save
 
 FOLDER, COARSE = "blocks", "coarse"
@@ -57,7 +58,9 @@ def in_blocks(pipeline: Pipeline, open_executor: OpenExecutor) -> Pipeline:
     """The pipeline, which trains in blocks if its settings ask for it."""
     stage = pipeline.layout.stage("train")
 
-    def train(inputs: Mapping[str, Any], settings: Any, folder: Path, report: Report) -> Any:
+    def train(
+        inputs: Mapping[str, Any], settings: TrainSettings, folder: Path, report: Report
+    ) -> Any:
         single = replace(settings, blocks="1")
         views = 0 if settings == single else len(inputs["sfm"].views)
         blocks = count_blocks(settings.blocks, views)
@@ -89,7 +92,7 @@ class _BlockTraining:
 
     pipeline: Pipeline
     whole: Reconstruction
-    settings: Any
+    settings: TrainSettings
     root: Path
     executor: Executor
     report: Report
@@ -309,7 +312,7 @@ def _with_roles(whole: Reconstruction) -> Reconstruction:
     return replace(whole, views=tuple(views))
 
 
-def _check(settings: Any) -> None:
+def _check(settings: TrainSettings) -> None:
     """Raises SplatError for settings that do not go with blocks."""
     if not settings.max_splats:
         raise UsageError(

@@ -11,6 +11,7 @@ from stages.base.stage import Report
 from stages.distributed.tasks import ChunkTask, Executor, OpenExecutor, Resources, run_all
 from stages.run.listener import Listener
 from stages.run.pipeline import Pipeline
+from stages.sfm.settings import SfmSettings
 from stages.sfm.worker.chunks import CHUNK_MEMORY_MIB, Chunk
 
 
@@ -18,7 +19,7 @@ def with_chunks(pipeline: Pipeline, open_executor: OpenExecutor) -> Pipeline:
     """The pipeline with the stage `sfm` in chunks."""
     run: Callable[..., Any] = pipeline.layout.stage("sfm").run
 
-    def sfm(inputs: Mapping[str, Any], settings: Any, folder: Path, report: Report) -> Any:
+    def sfm(inputs: Mapping[str, Any], settings: SfmSettings, folder: Path, report: Report) -> Any:
         if settings.cameras is not None:  # known cameras have few pairs to match
             return run(inputs, settings, folder, report)
         with open_executor(pipeline.run_folder, Listener()) as executor:
