@@ -24,7 +24,7 @@ def test_a_pixel_shows_the_same_point_in_every_world(
 ) -> None:
     world, seeds = WORLDS[name], small.splats
     there = in_world(small.reconstruction, world, tmp_path / "there")
-    moved = seeds_in_world(seeds, world)
+    moved = seeds_in_world(seeds, world, there)
     for view, turned in zip(small.reconstruction.views, there.views, strict=True):
         pixels, z = view.camera.project(seeds.means)
         found, depths = turned.camera.project(moved.means)
@@ -43,6 +43,6 @@ def test_a_pixel_shows_the_same_point_in_every_world(
 
 def test_seeds_grow_with_the_unit_and_keep_their_colours(small: SmallScene) -> None:
     seeds: Splats = small.splats
-    longer = seeds_in_world(seeds, WORLDS["in millimetres"])
+    longer = seeds_in_world(seeds, WORLDS["in millimetres"], small.reconstruction)
     np.testing.assert_allclose(np.exp(longer.log_scales - seeds.log_scales), 1000.0, rtol=1e-4)
     assert np.array_equal(longer.sh, seeds.sh)

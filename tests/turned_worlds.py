@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from stages.editing.transform import rotation_about
 from stages.scene import Reconstruction, Splats, View
+from stages.seed.axes import surface_rotations
 
 _FLIP = np.diag([-1.0, 1.0, 1.0])
 
@@ -91,12 +92,14 @@ def _write_mirrored(source: Path, view: View, target: Path) -> None:
     cv2.imencode(".png", np.ascontiguousarray(np.asarray(picture)[:, ::-1]))[1].tofile(path)
 
 
-def seeds_in_world(seeds: Splats, world: World) -> Splats:
-    """Seeds, which are spheres of one colour, in `world`. As the seed stage makes them there: their
-    own axes are those of that world."""
+def seeds_in_world(seeds: Splats, world: World, made: Reconstruction) -> Splats:
+    """Seeds of the capture `made`, which are spheres of one colour, in `world`, as the seed stage
+    makes them there. made: in that world."""
+    means, cameras = world.points(seeds.means), [view.camera for view in made.views]
     return replace(
         seeds,
-        means=world.points(seeds.means).astype(np.float32),
+        means=means.astype(np.float32),
+        quaternions=surface_rotations(means, cameras).astype(np.float32),
         log_scales=(seeds.log_scales + np.log(world.scale)).astype(np.float32),
         origin=np.zeros(3),
         draw_settings=replace(seeds.draw_settings, near=world.scale * seeds.draw_settings.near),

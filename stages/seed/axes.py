@@ -1,35 +1,52 @@
-"""The shape and rotation of first splats: those of the surface around them, as far as neighbours
-tell it.
+"""The rotation of first splats: along the surface around them, as far as neighbours tell it.
 
-Round splats with the world's axes flatten and split along these axes first, so that training gave
-other results in a turned world. Surfaces are flat close by: the axis in which a point's neighbours
-spread least is the normal, and a splat is thinner along it.
+First splats are round, and flatten and split along their own axes first. With the world's axes
+training gave other results in a turned world.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from stages.base.blocks import blocks
+from stages.scene import Camera
 from stages.scene.rotations import quaternions_of
 
 NEIGHBOURS = 16
-FLATTENING = 0.5  # of the scale along the normal
+STEEP = 0.3  # sine of the angle between up and the normal: of walls, not of floors
 
 
-def surface_axes(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(unit quaternions [N, 4], factors [N, 3] of the scales along the axes of these rotations) of
-    splats at `points` [N, 3], which are finite. The first axis is the normal."""
+def surface_rotations(
+    points: NDArray[np.float64], cameras: Sequence[Camera]
+) -> NDArray[np.float64]:
+    """[N, 4] unit quaternions of splats at `points` [N, 3], which are finite.
+
+    The first axis is the normal, in which the nearest neighbours of a point spread least. The
+    second is the direction on the surface that goes up in the pictures of `cameras`, because edges
+    do; on a floor, that in which the neighbours spread most.
+    """
+    up = _up(cameras)
     count = min(NEIGHBOURS + 1, len(points))
-    tree, turns = cKDTree(points), np.empty((len(points), 4))
+    tree, found = cKDTree(points), np.empty((len(points), 4))
     for rows in blocks(len(points)):
         near = points[np.reshape(tree.query(points[rows], count)[1], (-1, count))]
         spread = near - near.mean(axis=1, keepdims=True)
-        axes = np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread))[1]  # smallest first
-        axes[np.linalg.det(axes) < 0, :, 2] *= -1
-        turns[rows] = quaternions_of(axes)
-    factors = np.ones((len(points), 3))
-    factors[:, 0] = FLATTENING
-    return turns, factors
+        principal = np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread))[1]  # smallest first
+        normal, longest = principal[:, :, 0], principal[:, :, 2]
+        upward = up - (normal @ up)[:, None] * normal
+        size = np.linalg.norm(upward, axis=1, keepdims=True)
+        second = np.where(size > STEEP, upward / np.maximum(size, STEEP), longest)
+        axes = np.stack([normal, second, np.cross(normal, second)], axis=2)
+        found[rows] = quaternions_of(axes)
+    return found
+
+
+def _up(cameras: Sequence[Camera]) -> NDArray[np.float64]:
+    """[3] the mean of the cameras' up directions, a unit vector; 0 where they cancel out."""
+    mean = -np.sum([camera.world_to_camera[1, :3] for camera in cameras], axis=0)
+    size = float(np.linalg.norm(mean))
+    return np.asarray(mean / size if size > 0 else np.zeros(3))

@@ -18,7 +18,7 @@ class SeedSettings:
 
 STAGE = Stage(
     "seed",
-    version=6,
+    version=7,
     reads=("sfm",),
     settings_type=SeedSettings,
     **in_module("stages.seed.stage"),

@@ -1,8 +1,9 @@
 """Stage 3: Reconstruction -> Splats: initial splats at sparse points, and where there are none.
 
 Follows the reference trainer (Kerbl et al., 3D Gaussian Splatting, 2023, section 5.1): one round
-splat a point, as large as the mean distance to its three nearest neighbours, opacity 0.1. Outliers
-are left out; points of a plane sweep, measured depth and filled cells are added.
+splat a point, as large as the mean distance to its three nearest neighbours, opacity 0.1. Its axes
+are those of the surface around it (`axes`). Outliers are left out; points of a plane sweep,
+measured depth and filled cells are added.
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ from stages.scene import (
     rgb_to_dc,
     split_held_out,
 )
+from stages.scene.capture import geometric_median
 from stages.scene.storage import load_splats, save_splats
+from stages.seed.axes import surface_rotations
 from stages.seed.empty_cells import fill_cells
 from stages.seed.measured_depth import measured_points
 from stages.seed.neighbours import mean_neighbour_distance, nearest_distance
@@ -62,8 +65,8 @@ def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report:
     scales, clamped = _scales(points, reconstruction)
     report.metric("median_scale", float(np.median(scales)))
     report.metric("scales_clamped", clamped)
+    cameras = tuple(view.camera for view in training)
     if settings.fill:
-        cameras = tuple(view.camera for view in reconstruction.views)
         more, more_colours, more_scales = fill_cells(
             reconstruction.folder, chosen, points, cameras, training
         )
@@ -73,7 +76,7 @@ def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report:
     report.progress(1, 1, "seeding", splats=len(points))
     splats = Splats(
         means=points.astype(np.float32),
-        quaternions=np.tile(np.array([1, 0, 0, 0], np.float32), (len(points), 1)),
+        quaternions=surface_rotations(points, cameras).astype(np.float32),
         log_scales=np.repeat(np.log(scales)[:, None], 3, axis=1).astype(np.float32),
         opacity_logits=np.full(len(points), logit(OPACITY), np.float32),
         sh=rgb_to_dc(colours)[:, None, :].astype(np.float32),
@@ -129,7 +132,7 @@ def _outliers(
     points = np.where(finite[:, None], reconstruction.points, 0.0)
     errors = np.nan_to_num(reconstruction.errors_px, nan=np.inf, posinf=np.inf)
     centres = _camera_centres(reconstruction)
-    middle = np.median(points[finite], axis=0)
+    middle = geometric_median(points[finite])
     distances = np.linalg.norm(points - middle, axis=1)
     # Cameras count, too: a far background is normal for a capture of that size.
     reach = float(np.percentile(distances[finite], 90))
@@ -166,7 +169,9 @@ def _scales(
 
 
 def _camera_centres(reconstruction: Reconstruction) -> NDArray[np.float64]:
-    return np.array([view.camera.centre for view in reconstruction.views]).reshape(-1, 3)
+    """[V, 3] of the training views."""
+    views, _ = split_held_out(reconstruction.views)
+    return np.array([view.camera.centre for view in views]).reshape(-1, 3)
 
 
 def _report_outliers(

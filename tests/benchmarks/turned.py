@@ -57,7 +57,7 @@ def quality(made: Prepared, world: World, settings: TrainSettings) -> tuple[floa
         folder = Path(name)
         given = in_world(made.given, world, folder / "given")
         tests = in_world(made.tests, world, folder / "tests")
-        inputs = {"sfm": given, "seed": seeds_in_world(made.seeds, world)}
+        inputs = {"sfm": given, "seed": seeds_in_world(made.seeds, world, given)}
         trained: Splats = STAGE_OF["train"].run(inputs, settings, folder, Report()).splats
         drawn = draw_settings_of(given.views, settings.train_side)
         views = load_evaluation_views(tests.folder, tests.views, drawn)
