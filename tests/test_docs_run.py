@@ -45,7 +45,7 @@ def test_commands_of_readme_and_guide_run(sample_run: Path, tmp_path: Path) -> N
 
 def test_files_of_a_run_are_those_of_the_architecture_page(sample_run: Path) -> None:
     text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
-    table = text.split("### A run folder", 1)[1].split("## ", 1)[0]
+    table = text.split("## Stages and run folders", 1)[1].split("\n## ", 1)[0]
     rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
     named = set()
     for row in rows:

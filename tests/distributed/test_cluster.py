@@ -142,10 +142,10 @@ def cameras_of(folder: Path, address: str | None, kills: int = 0) -> dict[str, s
     name = f"at-{address}"
     code = (
         "from pathlib import Path; from splatcli import run_settings; "
-        "from splatcli.commands import process; "
+        "from splatcli.distribution import distributed; "
         "from stages.run.pipeline import Pipeline; "
         f"whole = Pipeline(Path({name!r}), Path({str(sample.PHOTOS)!r})); "
-        f"process.distribute(whole, {address!r}).run(run_settings.defaults(), until='sfm')"
+        f"distributed(whole, {address!r}).run(run_settings.defaults(), until='sfm')"
     )
     assert with_kills(folder, processes.python(code), kills) == kills
     return outputs(folder / name, "")

@@ -358,8 +358,9 @@ def test_killed_at_any_moment_a_run_ends_in_the_same_bytes(
 ) -> None:
     _, _, whole = small
     code = (
-        "from pathlib import Path; from stages import sfm; from stages.base.stage import Report;"
-        "from tests.sfm import bad_captures as b;"
+        "from pathlib import Path; from stages.base.stage import Report;"
+        "from stages.sfm import stage as sfm; from stages.sfm.settings import SfmSettings;"
+        "from tests.sfm.checks import bad_captures as b;"
         "s = SfmSettings(max_features=2000);"
         "sfm.run({'ingest': b.sample(9)}, s, Path(sys.argv[1]), Report())"
     )
