@@ -112,7 +112,7 @@ PRESETS: dict[str, TrainSettings] = {
 
 STAGE = Stage(
     "train",
-    version=30,
+    version=31,
     reads=("sfm", "seed"),
     settings_type=TrainSettings,
     **in_module("stages.train.stage"),
