@@ -83,6 +83,20 @@ def test_a_grid_gives_splats_as_large_as_its_spacing(tmp_path: Path) -> None:
     assert report.metrics["outliers"] == 0
 
 
+def test_where_a_held_out_photograph_stood_changes_nothing(tmp_path: Path) -> None:
+    scene = grid()
+    known = tuple(replace(view, role="train") for view in scene.views)
+    found = []
+    for name, eye in (("a", [0.0, 0.1, -0.2]), ("b", [40.0, -30.0, -5.0])):
+        pose = look_at(np.array(eye), np.zeros(3))
+        camera = replace(scene.views[0].camera, world_to_camera=pose)
+        held = replace(scene.views[0], role="test", camera=camera)
+        (tmp_path / name).mkdir()
+        run(replace(scene, views=(*known, held)), tmp_path / name)
+        found.append((tmp_path / name / "splats.bin").read_bytes())
+    assert found[0] == found[1]
+
+
 @pytest.mark.parametrize(
     ("point", "changes", "reason"),
     [
