@@ -125,8 +125,8 @@ def stages() -> str:
 
 
 def formats() -> str:
+    from stages.formats.format_table import BY_ENDING
     from stages.formats.mesh_table import MESHES
-    from stages.formats.table import BY_ENDING
 
     assert [e for endings, _, _ in FORMAT_CELLS for e in endings] == [*BY_ENDING, *MESHES]
     y_up = {row.ending for row in BY_ENDING.values() if row.y_up}
@@ -157,7 +157,7 @@ def _place(function: Any) -> str:
 
 
 def cameras() -> str:
-    from stages.cameras.table import CAMERA_FILES
+    from stages.cameras.camera_formats import CAMERA_FILES
 
     rows: list[tuple[str, ...]] = []
     for row in CAMERA_FILES:

@@ -12,7 +12,7 @@ import pytest
 
 from splatcli.app import ENTRIES, loaded
 from stages.base.distribution import VERSION
-from stages.formats.table import TABLE
+from stages.formats.format_table import TABLE
 from stages.run.stages import STAGE_NAMES
 from stages.train.settings import PRESETS
 from tests.docs_commands import bash_lines, inline_commands, splat_commands

@@ -13,7 +13,7 @@ from stages.base.atomic import make_folder
 from stages.base.errors import SplatError, UsageError
 from stages.cameras import colmap, nerfstudio
 from stages.cameras.camera_file import NO_POINTS, CameraFile
-from stages.cameras.table import read_cameras
+from stages.cameras.camera_formats import read_cameras
 from stages.run import runfolder
 from stages.run.pipeline import Pipeline
 

@@ -6,12 +6,12 @@ from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
-from splatcli import console, log, options, progress, run_settings, summary
+from splatcli import console, log, options, progress, run_result, run_settings
 from splatcli.arguments import Cluster, Out, Photos, Run
 from splatcli.folders import DEFAULT, find_run_folder
 from stages.base.errors import UsageError
 from stages.base.settings import changed
-from stages.cameras.table import read_cameras
+from stages.cameras.camera_formats import read_cameras
 from stages.run import runfolder
 from stages.run.listener import Listener, Listeners
 from stages.run.pipeline import Pipeline
@@ -142,7 +142,7 @@ def _run(
     if view:
         listeners.insert(0, _live_training(pipeline))
     pipeline.run(settings, until=until, may_run=may_run, listener=Listeners(*listeners))
-    summary.show(pipeline, until)
+    run_result.show(pipeline, until)
 
 
 def _live_training(pipeline: Pipeline) -> Listener:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from splatcli import console, summary
+from splatcli import console, run_result
 from splatcli.arguments import Run
 from splatcli.folders import find_run_folder
 from stages.run.pipeline import Pipeline, Step
@@ -47,9 +47,9 @@ def _print(pipeline: Pipeline, steps: list[Step], busy: int | None) -> None:
             (
                 f"{s.number}-{s.stage.name}",
                 _state(s, busy),
-                summary.time_of(s.manifest) if s.manifest else "-",
+                run_result.time_of(s.manifest) if s.manifest else "-",
                 f"{s.manifest.peak_memory_mib:,.0f} MiB" if s.manifest else "-",
-                s.reason or (summary.headline(s.manifest) if s.manifest else ""),
+                s.reason or (run_result.headline(s.manifest) if s.manifest else ""),
             )
             for s in steps
         ],

@@ -20,13 +20,13 @@ from stages.base.stage import Report
 from stages.base.text import counted
 from stages.export.settings import ExportSettings
 from stages.formats import Format, format_of
+from stages.formats.format_table import FORMATS
 from stages.formats.losses import losses_of
 from stages.formats.mesh_files import CODECS_OF_MESHES
 from stages.formats.output_formats import (
     mesh_formats,
 )
 from stages.formats.sog_quantisation import splats_to_write
-from stages.formats.table import FORMATS
 from stages.formats.values import drop_undrawable
 from stages.mesh.collision_mesh import make_collision_mesh
 from stages.proof.prover import Prover, cameras_for, provers_of

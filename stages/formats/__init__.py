@@ -9,8 +9,9 @@ To add a format, in six steps:
 2. Write `read(path)` in the same module, or in one beside it. It raises
    `base.bad_files.BadFileError`, or what damaged bytes cause in Python and NumPy; `formats.read`
    turns both into SplatError, and checks the values.
-3. Add a row to `table.TABLE`, and its functions to `codecs.CODECS`. `splat export`, `convert`,
-   `verify`, `info` and their help, the fuzzer and the tests of all formats are driven by the table.
+3. Add a row to `format_table.TABLE`, and its functions to `codecs.CODECS`. `splat export`,
+   `convert`, `verify`, `info` and their help, the fuzzer and the tests of all formats are driven by
+   the table.
 4. Write an independent reader (of a library, or of raw bytes) in `stages.proof`, and add its row
    to `stages.proof.checks.CHECKS`.
 5. Say in the tables of `tests/docs_tables.py` what the format opens in and keeps, and run
@@ -28,7 +29,7 @@ from typing import TYPE_CHECKING, Any
 
 from stages.base.atomic import remove_abandoned_files
 from stages.base.bad_files import reading
-from stages.formats.table import BY_ENDING, FORMATS, Format, format_of
+from stages.formats.format_table import BY_ENDING, FORMATS, Format, format_of
 
 if TYPE_CHECKING:
     from stages.scene import Splats, View

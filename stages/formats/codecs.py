@@ -1,4 +1,4 @@
-"""The functions of every splat format, by the ending of its row in `stages.formats.table`."""
+"""The functions of every splat format, by the ending of its row in `formats.format_table`."""
 
 from __future__ import annotations
 

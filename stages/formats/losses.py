@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from stages.formats.codecs import CODECS
+from stages.formats.format_table import Format
 from stages.formats.offset import is_located, offset_path
-from stages.formats.table import Format
 from stages.formats.values import drop_undrawable
 from stages.scene import Splats
 

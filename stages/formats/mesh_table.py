@@ -2,7 +2,7 @@
 
 To add a format, put a function (path, mesh, units) that writes it and an independent reader into
 `mesh_files` and name both in its `CODECS_OF_MESHES`, add a row to `MESHES`, and extend the pattern
-of mesh names in `stages.formats.table`.
+of mesh names in `stages.formats.format_table`.
 """
 
 from __future__ import annotations

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from stages.base.atomic import replacing
+from stages.formats.format_table import Format
 from stages.formats.json_fields import located
-from stages.formats.table import Format
 from stages.scene import Splats
 from stages.scene.flip import flipped
 

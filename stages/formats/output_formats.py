@@ -6,8 +6,8 @@ from collections.abc import Iterable
 from typing import Any
 
 from stages.base.settings import setting
+from stages.formats.format_table import AUTO, DRAWINGS, FORMATS
 from stages.formats.mesh_table import MESHES, MeshFormat
-from stages.formats.table import AUTO, DRAWINGS, FORMATS
 
 DEFAULT_FORMATS = ("ply", "splat", "glb", "usdz")
 LOSSLESS = "ply"

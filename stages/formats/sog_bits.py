@@ -10,6 +10,7 @@ from pathlib import Path
 
 from stages import formats
 from stages.formats.axes import smallest_rotations
+from stages.formats.format_table import Format
 from stages.formats.sog_quantisation import (
     BitDepths,
     palette_bits,
@@ -17,7 +18,6 @@ from stages.formats.sog_quantisation import (
     quantise_for_sog,
     quantise_splats,
 )
-from stages.formats.table import Format
 from stages.formats.values import drop_undrawable
 from stages.scene import Splats, View
 

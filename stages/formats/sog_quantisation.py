@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from stages.formats import codebook, smallest_three
 from stages.formats.axes import smallest_rotations
+from stages.formats.format_table import Format
 from stages.formats.sog import (
     LOG_SCALE_LIMIT,
     STEPS,
@@ -22,7 +23,6 @@ from stages.formats.sog import (
     symmetric_log,
 )
 from stages.formats.sog_read import symmetric_exp
-from stages.formats.table import Format
 from stages.formats.values import (
     drop_undrawable,
     linear_opacities,

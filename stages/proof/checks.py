@@ -1,7 +1,7 @@
 """How a splat file is checked by code that did not write it: one row for each format.
 
-A row is found by the ending of the file's format in `stages.formats.table`. To add one, write the
-independent reader in `independent_readers` or `independent_packed` and name it here.
+A row is found by the ending of the file's format in `formats.format_table`. To add one, write
+the independent reader in `independent_readers` or `independent_packed` and name it here.
 """
 
 from __future__ import annotations

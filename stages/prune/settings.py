@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from stages.base.settings import setting
 from stages.base.stage import Stage, in_module
-from stages.formats.table import FORMATS
+from stages.formats.format_table import FORMATS
 from stages.raster.backends import backend_setting, device_setting
 
 SOG_LOSS_DB = 0.3  # PSNR of training views that the bit depths of a .sog file may cost

@@ -22,8 +22,8 @@ from stages.evaluate.evaluation import (
     mean_psnr_db,
     psnr_of_views_db,
 )
+from stages.formats.format_table import FORMATS
 from stages.formats.sog_bits import choose_bits, file_size_bytes
-from stages.formats.table import FORMATS
 from stages.prune.rounds import Pruner, PruningResult
 from stages.prune.settings import DECIDING_VIEWS, SOG_LOSS_DB, PruneSettings
 from stages.prune.summary import advise_more_splats, describe_loss, summarise

@@ -13,8 +13,8 @@ from stages.base.stage import Report
 from stages.evaluate.contribution import measure_contributions
 from stages.evaluate.evaluation import EvaluationView, load_evaluation_views, mean_psnr_db
 from stages.formats.axes import smallest_rotations
+from stages.formats.format_table import FORMATS, Format
 from stages.formats.sog_quantisation import BitDepths, quantise_splats, splats_to_write
-from stages.formats.table import FORMATS, Format
 from stages.formats.values import drop_undrawable
 from stages.quantise.rounding import finetune_to_rounding, write_and_read
 from stages.quantise.settings import QuantiseSettings

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from stages import formats
 from stages.formats.codecs import CODECS
-from stages.formats.table import Format
+from stages.formats.format_table import Format
 from stages.scene import Splats
 from stages.train.finetune import FineTuner
 

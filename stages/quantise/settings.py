@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from stages.base.settings import setting
 from stages.base.stage import Stage, in_module
+from stages.formats.format_table import AUTO
 from stages.formats.output_formats import (
     CHOICES,
     DEFAULT_FORMATS,
@@ -13,7 +14,6 @@ from stages.formats.output_formats import (
     formats_setting,
     formats_to_finetune,
 )
-from stages.formats.table import AUTO
 from stages.prune.settings import DECIDING_VIEWS, SOG_LOSS_DB
 from stages.raster.backends import backend_setting, device_setting
 

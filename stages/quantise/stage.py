@@ -33,9 +33,9 @@ from stages.evaluate.evaluation import (
     psnr_name,
 )
 from stages.evaluate.sh import sufficient_degrees, truncate_sh, view_averaged_dc
+from stages.formats.format_table import FORMATS, PLAIN
 from stages.formats.sog_bits import choose_bits
 from stages.formats.sog_quantisation import splats_to_write
-from stages.formats.table import FORMATS, PLAIN
 from stages.quantise.format_finetuning import FormatFinetuning
 from stages.quantise.rounding import write_and_read
 from stages.quantise.settings import QuantiseSettings

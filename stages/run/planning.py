@@ -102,7 +102,7 @@ class Planner:
         maps, and files that settings name. Named files that were removed after the stage finished
         count as unchanged."""
         # They load NumPy, which `splat --help` does without.
-        from stages.cameras.table import files_of
+        from stages.cameras.camera_formats import files_of
         from stages.ingest import depth_files, masks
 
         done = Manifest.read(self.layout.workspace(stage).final)

@@ -138,7 +138,7 @@ class QuantisedSplats:
             fine-tuned to that rounding.
         plain: the splats for formats that are drawn without opacity compensation; None where
             `splats` are drawn without it, or no such format was requested.
-        drawing: which formats these are, see `formats.table.Format.holds_antialiased`.
+        drawing: which formats these are, see `formats.format_table.Format.holds_antialiased`.
     """
 
     splats: Splats

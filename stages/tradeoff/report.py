@@ -10,7 +10,7 @@ import numpy as np
 from stages.base.atomic import write_csv
 from stages.evaluate.evaluation import image_renderer
 from stages.evaluate.image_metrics import psnr_text
-from stages.tradeoff import html, summary
+from stages.tradeoff import html, report_text
 from stages.tradeoff.curves import OperatingPoint, Tradeoff
 from stages.tradeoff.measurement import TradeoffInputs
 from stages.tradeoff.plots import write_plots
@@ -21,12 +21,12 @@ _COLUMNS = (
     *("psnr_db", "change_db", "change_low_db", "change_high_db"),
 )
 _SECTIONS = {
-    "time": ("Time", summary.about_time),
-    "formats": ("Bytes", summary.about_formats),
-    "splats": ("Splats", summary.about_splats),
-    "drawing": ("Drawing", summary.about_drawing),
-    "coverage": ("Coverage", summary.about_coverage),
-    "photographs": ("Photographs", summary.about_photographs),
+    "time": ("Time", report_text.about_time),
+    "formats": ("Bytes", report_text.about_formats),
+    "splats": ("Splats", report_text.about_splats),
+    "drawing": ("Drawing", report_text.about_drawing),
+    "coverage": ("Coverage", report_text.about_coverage),
+    "photographs": ("Photographs", report_text.about_photographs),
 }
 
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from stages.base.settings import setting
 from stages.base.stage import Stage, in_module
+from stages.formats.format_table import PLAIN
 from stages.formats.output_formats import drawing_setting
-from stages.formats.table import PLAIN
 from stages.raster.backends import backend_setting, device_setting
 
 

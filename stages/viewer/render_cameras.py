@@ -9,7 +9,7 @@ from pathlib import Path
 
 from stages.base.errors import UsageError
 from stages.base.text import counted
-from stages.cameras.table import read_cameras
+from stages.cameras.camera_formats import read_cameras
 from stages.scene import Camera, Splats, View
 from stages.scene.framing import front_camera
 from stages.viewer import camera_paths, orbit

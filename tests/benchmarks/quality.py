@@ -32,7 +32,7 @@ from rich.table import Table
 
 from stages.base.errors import SplatError
 from stages.base.stage import Report
-from stages.cameras.table import read_cameras
+from stages.cameras.camera_formats import read_cameras
 from stages.evaluate.evaluation import (
     SIZES,
     EvaluationView,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stages.cameras.table import read_cameras
+from stages.cameras.camera_formats import read_cameras
 from stages.evaluate.evaluation import SIZES, EvaluationView
 from stages.evaluate.image_metrics import IDENTICAL_DB
 from stages.raster.draw import raster_settings_of, render

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from stages.cameras.camera_file import Georeference
-from stages.cameras.table import read_cameras
+from stages.cameras.camera_formats import read_cameras
 from stages.scene.place import GEOGRAPHIC
 from tests.cameras.drawn import CHUNK, EYES, metashape, opensfm
 from tests.cameras.drawn_surveys import MADE, SHIFT, UTM32, arkit, opf, polycam

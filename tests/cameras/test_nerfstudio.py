@@ -13,8 +13,8 @@ from PIL import Image
 from plyfile import PlyData
 
 from stages.base.errors import SplatError
+from stages.cameras.camera_formats import read_cameras, read_points
 from stages.cameras.nerfstudio import write
-from stages.cameras.table import read_cameras, read_points
 from stages.scene import Camera, View, look_at
 from tests.sfm.synthetic import random_rotation
 

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from stages.base.errors import SplatError
-from stages.cameras.table import CAMERA_FILES, files_of, read_cameras, read_points
+from stages.cameras.camera_formats import CAMERA_FILES, files_of, read_cameras, read_points
 from tests.cameras.drawn import (
     COLOURS,
     HEIGHT,

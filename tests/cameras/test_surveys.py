@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from stages.base.errors import SplatError
-from stages.cameras.table import files_of, read_cameras
+from stages.cameras.camera_formats import files_of, read_cameras
 from tests.cameras.drawn_surveys import arkit, opf, polycam, realityscan_xmp
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from stages.cameras.camera_formats import read_cameras
 from stages.cameras.colmap import read_model
-from stages.cameras.table import read_cameras
 from tests.cameras.models import example
 
 

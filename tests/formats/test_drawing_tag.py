@@ -11,8 +11,8 @@ import pytest
 
 from stages import formats
 from stages.base.errors import SplatError
+from stages.formats.format_table import ANTIALIASED, AUTO, FORMATS, PLAIN
 from stages.formats.losses import losses_of
-from stages.formats.table import ANTIALIASED, AUTO, FORMATS, PLAIN
 from stages.proof.prover import Prover, cameras_for
 from tests.scenes import cloud
 

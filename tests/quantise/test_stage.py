@@ -15,8 +15,8 @@ from stages.base.settings import check_settings
 from stages.base.stage import Report
 from stages.evaluate.evaluation import load_evaluation_views, mean_psnr_db
 from stages.evaluate.sh import sufficient_degrees, truncate_sh, truncation_rms
+from stages.formats.format_table import FORMATS
 from stages.formats.sog_quantisation import splats_to_write
-from stages.formats.table import FORMATS
 from stages.quantise import stage as quantise
 from stages.quantise.settings import QuantiseSettings
 from stages.scene import QuantisedSplats, TrainedSplats, dc_to_rgb, split_held_out

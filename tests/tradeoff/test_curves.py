@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stages.evaluate.coverage import Patches
-from stages.tradeoff import summary
+from stages.tradeoff import report_text
 from stages.tradeoff.bootstrap import paired_difference
 from stages.tradeoff.curves import (
     Coverage,
@@ -51,15 +51,15 @@ def test_a_curve_that_gains_more_and_more_has_no_knee():
 
 def test_a_loss_is_a_cost_and_its_interval_has_the_same_sign():
     change = paired_difference(np.array([-0.2, -0.22, -0.18, -0.2, -0.21, -0.19]))
-    text = summary.costs(change)
+    text = report_text.costs(change)
     assert text.startswith("costs 0.20 dB (95 %: 0.1")
     low, high = (float(x) for x in text.split("%: ")[1].rstrip(")").split(" to "))
     assert low < 0.2 < high
 
 
 def test_a_single_view_has_no_interval():
-    assert summary.costs(paired_difference(np.array([-0.2]))) == "costs 0.20 dB (one view)"
-    assert summary.costs(paired_difference(np.array([0.2]))) == "gains 0.20 dB (one view)"
+    assert report_text.costs(paired_difference(np.array([-0.2]))) == "costs 0.20 dB (one view)"
+    assert report_text.costs(paired_difference(np.array([0.2]))) == "gains 0.20 dB (one view)"
 
 
 def empty_coverage() -> Coverage:
@@ -74,4 +74,4 @@ def test_a_run_without_a_log_says_so(logged):
     own = OperatingPoint("as it is", 100, 20.0, paired_difference(np.zeros(3)))
     course = tuple(history(20.0)[:logged])
     tradeoff = Tradeoff(own, course, (), (own,), (), 480, empty_coverage())
-    assert summary.about_time(tradeoff) == [summary.NO_TIMES]
+    assert report_text.about_time(tradeoff) == [report_text.NO_TIMES]

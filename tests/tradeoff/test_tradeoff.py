@@ -24,7 +24,7 @@ from stages.scene import (
     evenly_spaced,
     split_held_out,
 )
-from stages.tradeoff import summary
+from stages.tradeoff import report_text
 from stages.tradeoff.bootstrap import BETTER, INCONCLUSIVE, WORSE
 from stages.tradeoff.comparison import (
     Candidate,
@@ -169,7 +169,7 @@ def test_the_report_is_one_file_that_needs_no_other(tradeoff, inputs, tmp_path) 
     assert not re.findall(r"(?:src|href)=\"(?!data:)", text)
     assert "<script" not in text
     assert "Trade-off report: &lt;scene&gt;" in text
-    assert summary.FINE_TUNED in text
+    assert report_text.FINE_TUNED in text
     assert tradeoff.worst.name in text
     assert "<h2>Coverage</h2>" in text
     assert "Gap 1, straight above" in text  # ten cameras in a ring
@@ -213,7 +213,7 @@ def test_a_run_without_a_log_gets_the_other_curves(inputs, tmp_path) -> None:
     tradeoff = measure_tradeoff(replace(inputs, history=()), lambda label: None)
     files = write_report(tmp_path, "scene", tradeoff, inputs)
     assert "time.png" not in {file.name for file in files}
-    assert summary.NO_TIMES in (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert report_text.NO_TIMES in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from splatcli.summary import headline
+from splatcli.run_result import headline
 from stages.base.errors import Interrupted, SplatError
 from stages.base.stage import Report
 from stages.evaluate.evaluation import EvaluationView, evaluate

@@ -19,8 +19,8 @@ from stages.base.errors import ReconstructionError, SplatError, UsageError
 from stages.base.stage import Report
 from stages.base.text import counted
 from stages.cameras.camera_file import FilePoints
+from stages.cameras.camera_formats import read_cameras, read_points
 from stages.cameras.colmap import Observations
-from stages.cameras.table import read_cameras, read_points
 from stages.cameras.undistortion import undistorted_camera
 from stages.scene import Camera, Capture, Photo, Reconstruction
 from stages.scene.rotations import quaternions_of

@@ -12,7 +12,7 @@ import numpy as np
 from stages.scene import DrawSettings, Splats, View
 from stages.tradeoff.curves import Coverage, Tradeoff
 from stages.tradeoff.measurement import measure_coverage
-from stages.tradeoff.summary import about_coverage
+from stages.tradeoff.report_text import about_coverage
 from tests.evaluate.rings import ball, place, ring, surface
 
 
