@@ -21,7 +21,8 @@ from splatcli.arguments import AS_JSON, QUIET, VERBOSE
 from splatcli.command_group import CommandGroup
 from splatcli.console import guarded
 from splatcli.operation_options import OrderedCommand, operation_parameters
-from splatcli.options import with_parameters
+from splatcli.options import parameters, with_parameters
+from splatcli.render_options import RenderOptions
 from splatcli.watched import watched
 from stages.base.distribution import NAME, VERSION
 from stages.run.stages import STAGE_NAMES
@@ -101,6 +102,7 @@ ENTRIES = {
         "Draw the splats: from a photograph's camera, or as a film along a path.",
         "splat render run/ --path orbit --out film.mp4",
         _RESULT,
+        lambda: parameters(RenderOptions),
     ),
     "view": Entry(
         "Show the splats in a browser: orbit, fly, stand where the photographs were taken.",

@@ -1,14 +1,14 @@
 """Sinks: they receive renderings one after another and write pictures or films.
 
-Pictures: colours in 8 bits, depth in float32 or as colours. Films: H.264 in an .mp4 file that
-browsers, phones and editors play.
+Pictures: colours in 8 bits, depth in float32. Films: H.264 in an .mp4 file that browsers, phones
+and editors play.
 """
 
 from __future__ import annotations
 
 import errno
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 
@@ -19,17 +19,11 @@ from PIL import Image
 from stages.base.atomic import make_folder, replacing
 from stages.base.errors import ResourceError
 from stages.raster.definition import Rendering
-from stages.scene import Camera
 
 _BT709 = 1  # ITU-T H.273: primaries, transfer and matrix have the same number
 _LIMITED_RANGE = 1  # luma in 16..235, as players expect
 _FFMPEG_ERRORS = 256  # FFmpeg's own error numbers start here, above the system's
 _CONSTANT_QUALITY = "17"  # of x264's 0..51; differences from the pictures are hard to see
-# From near to far; luminance decreases with depth.
-_NEAR_TO_FAR = np.array(
-    [(255, 247, 206), (255, 196, 96), (240, 112, 74), (174, 50, 110), (86, 26, 118), (12, 10, 48)]
-)
-_BACKGROUND = (0, 0, 0)
 
 AddFrame = Callable[[NDArray[np.uint8]], None]
 
@@ -82,9 +76,6 @@ def film(path: Path, width: int, height: int, fps: float) -> Iterator[AddFrame]:
             ) from error
 
 
-_SAMPLED = 12  # frames of a path that determine its depth range
-_SAMPLED_SIDE = 240  # pixels
-
 Put = Callable[[Rendering], None]
 
 
@@ -119,32 +110,10 @@ def frames_beyond(folder: Path, frames: int) -> int:
 
 
 @contextmanager
-def film_sink(
-    path: Path, width: int, height: int, fps: float, near_far: tuple[float, float] | None
-) -> Iterator[Put]:
-    """Writes the film `path`; with a depth range also a film of the depth colours, .depth.mp4. Both
-    are written whole at the end. Raises SplatError."""
-    with ExitStack() as stack:
-        add = stack.enter_context(film(path, width, height, fps))
-        add_depth = None
-        if near_far is not None:
-            beside = path.with_suffix(".depth.mp4")
-            add_depth = stack.enter_context(film(beside, width, height, fps))
-
-        def put(rendering: Rendering) -> None:
-            add(eight_bits(rendering.image))
-            if add_depth is not None and near_far is not None:
-                add_depth(depth_colours(rendering.median_depth, *near_far))
-
-        yield put
-
-
-def sampled_range(
-    draw: Callable[[Camera], Rendering], cameras: Sequence[Camera]
-) -> tuple[float, float]:
-    """(near, far) of a whole path, so that a colour is the same depth in every frame."""
-    some = cameras[:: max(1, len(cameras) // _SAMPLED)]
-    return depth_range([draw(camera.fitted(_SAMPLED_SIDE)).median_depth for camera in some])
+def film_sink(path: Path, width: int, height: int, fps: float) -> Iterator[Put]:
+    """Writes the film `path`, whole at the end. Raises SplatError."""
+    with film(path, width, height, fps) as add:
+        yield lambda rendering: add(eight_bits(rendering.image))
 
 
 def eight_bits(image: NDArray[np.floating]) -> NDArray[np.uint8]:
@@ -160,22 +129,3 @@ def save_picture(path: Path, pixels: NDArray[np.uint8] | NDArray[np.float32]) ->
     as .tiff: z in world units, 0 for the background. Raises SplatError."""
     with replacing(path) as partial:
         Image.fromarray(pixels).save(partial)
-
-
-def depth_range(depths: Sequence[NDArray[np.float32]]) -> tuple[float, float]:
-    """(near, far): the 2nd and 98th percentile of all depths that are not background."""
-    seen = np.concatenate([depth[np.isfinite(depth) & (depth > 0)] for depth in depths])
-    if not len(seen):
-        return 1.0, 2.0
-    near, far = np.percentile(seen, (2, 98))
-    return float(near), float(max(far, near * 1.001))
-
-
-def depth_colours(depth: NDArray[np.float32], near: float, far: float) -> NDArray[np.uint8]:
-    """[H, W, 3] uint8: light where near, dark where far, linear in 1 / z; black background."""
-    shown = np.isfinite(depth) & (depth > 0)
-    inverse = 1.0 / np.where(shown, depth, far)
-    share = np.clip((1 / near - inverse) / (1 / near - 1 / far), 0.0, 1.0)
-    stops = np.linspace(0.0, 1.0, len(_NEAR_TO_FAR))
-    colours = np.stack([np.interp(share, stops, column) for column in _NEAR_TO_FAR.T], axis=-1)
-    return np.where(shown[..., None], np.rint(colours), _BACKGROUND).astype(np.uint8)

@@ -12,8 +12,6 @@ import pytest
 
 from stages.base.errors import SplatError
 from stages.viewer.sinks import (
-    depth_colours,
-    depth_range,
     eight_bits,
     film,
     save_picture,
@@ -138,22 +136,3 @@ def test_pictures_are_read_back_exactly(tmp_path: Path) -> None:
     read = cv2.imread(str(tmp_path / "a.png"))
     assert read is not None
     assert read[..., ::-1].tolist() == [[[0, 128, 255], [255, 0, 0]]]
-
-
-def test_depth_is_lighter_where_nearer_and_black_where_nothing_is() -> None:
-    depth = np.array([[1.0, 1.5, 2.0, 3.0, 8.0, 0.0, np.nan]], np.float32)
-    grey = depth_colours(depth, 1.0, 8.0)[0].astype(int).sum(1)
-    assert (np.diff(grey) < 0)[:5].all()
-    assert grey[-2:].tolist() == [0, 0]
-    beyond = depth_colours(np.array([[0.1, 1.0, 8.0, 99.0]], np.float32), 1.0, 8.0)[0]
-    assert beyond[0].tolist() == beyond[1].tolist()
-    assert beyond[2].tolist() == beyond[3].tolist()
-
-
-def test_the_range_of_depth_excludes_outliers_and_empty_pixels() -> None:
-    depth = np.concatenate([np.zeros(500), np.linspace(2, 4, 1000), [1e6]]).astype(np.float32)
-    near, far = depth_range([depth[None], np.full((2, 2), np.nan, np.float32)])
-    assert near == pytest.approx(2.04, abs=0.01)
-    assert far == pytest.approx(3.96, abs=0.01)
-    near, far = depth_range([np.zeros((3, 3), np.float32)])
-    assert 0 < near < far
