@@ -14,9 +14,7 @@ from typing import Any
 from stages.base.errors import Interrupted
 from stages.base.libraries import versions
 from stages.base.memory import PeakMemory
-from stages.base.stage import (
-    Report,
-)
+from stages.base.stage import Report
 from stages.base.text import reason_of
 from stages.run.digests import combined_digest, record_files
 from stages.run.failures import as_splat_error
@@ -65,6 +63,13 @@ def attempt(
         raise explained from error
     finally:
         usage.note(memory.peak_mib, now=True)
+    for name, kept in space.files_of_others(space.final, space.partial).items():
+        if name != kept:
+            report.warn(
+                "run-file-kept",
+                f"{space.label}/{name} is not what splat wrote under that name. It was moved to "
+                f"{space.label}/{kept}.",
+            )
     manifest = _manifest(request, report, space.partial, usage)
     space.finish(manifest)
     return manifest

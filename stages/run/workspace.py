@@ -2,26 +2,31 @@
 
 `4-train` holds finished output. `.4-train.partial` is the working folder; it is kept after an
 interruption, and after a failure with the reason in it. `.4-train.old` is the previous output
-between the two renames that replace it. After a crash at any point either the old or the new
-output is complete.
+between the two renames that replace it, and until the files in it that the stage did not write
+have moved to the new output. After a crash at any point either the old or the new output is
+complete, and those files are in one of the two.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from stages.base.atomic import sync_folder
+from stages.base.errors import SplatError
 from stages.base.stage import Stage
+from stages.run.digests import damage
 from stages.run.manifest import MANIFEST, Manifest, write_json
 from stages.run.request import REQUEST, Request
 
 USAGE = "usage.json"
 _FAILURE = "failure.json"
 _FILES = (MANIFEST, REQUEST, USAGE, _FAILURE)
+KEPT = "kept"  # folder in an output, for files of others whose name the stage needs
 BOOKKEEPING = frozenset([*_FILES, *(name + ".tmp" for name in _FILES)])
 
 
@@ -43,6 +48,10 @@ class Workspace:
     @property
     def old(self) -> Path:
         return self.run_folder / f".{self.label}.old"
+
+    @property
+    def _dropped(self) -> Path:
+        return self.run_folder / f".{self.label}.dropped"
 
     def note_failure(self, code: str, given: str) -> None:
         """Record in the working folder why the attempt failed, if the disk allows it."""
@@ -85,20 +94,58 @@ class Workspace:
         elif self.old.exists() and not self.final.exists():
             self.old.rename(self.final)
             sync_folder(self.run_folder)
-        if self.old.exists():
-            shutil.rmtree(self.old)
+        self._drop_old()
+
+    def files_of_others(self, old: Path, new: Path) -> dict[str, str]:
+        """The files in the output `old` that the stage did not write, or that were changed since,
+        and the name that each gets in the output `new`: its own if the stage has not written that
+        name, and else one in the folder `KEPT`. Raises OSError."""
+        try:
+            manifest = Manifest.read(old)
+        except SplatError:
+            manifest = None
+        outputs = manifest.outputs if manifest else {}
+        found = {}
+        for path in sorted(old.rglob("*")):
+            name = path.relative_to(old).as_posix()
+            if name in BOOKKEEPING or (path.is_dir() and not path.is_symlink()):
+                continue
+            if name not in outputs or damage(old, {name: outputs[name]}):
+                own = manifest and name not in outputs and not os.path.lexists(new / name)
+                found[name] = name if own else _free_name(new, f"{KEPT}/{name}")
+        return found
 
     def _replace(self) -> None:
         for name in BOOKKEEPING - {MANIFEST}:
             (self.partial / name).unlink(missing_ok=True)
         if self.final.exists():
-            if self.old.exists():
-                shutil.rmtree(self.old)
+            self._drop_old()
             self.final.rename(self.old)
         self.partial.rename(self.final)
         sync_folder(self.run_folder)  # before the old output goes
+        self._drop_old()
+
+    def _drop_old(self) -> None:
+        """Delete the previous output, and move files of others in it to the present one."""
         if self.old.exists():
-            shutil.rmtree(self.old, ignore_errors=True)
+            for name, kept in self.files_of_others(self.old, self.final).items():
+                (self.final / kept).parent.mkdir(parents=True, exist_ok=True)
+                (self.old / name).rename(self.final / kept)
+                sync_folder((self.final / kept).parent)
+            if self._dropped.exists():
+                shutil.rmtree(self._dropped)
+            self.old.rename(self._dropped)  # half deleted, it would not tell what is whose
+            sync_folder(self.run_folder)
+        shutil.rmtree(self._dropped, ignore_errors=True)
+
+
+def _free_name(folder: Path, name: str) -> str:
+    """`name`, or one with a number before its suffix, that nothing in `folder` has."""
+    path, number, free = Path(name), 1, name
+    while os.path.lexists(folder / free):
+        number += 1
+        free = path.with_name(f"{path.stem}-{number}{path.suffix}").as_posix()
+    return free
 
 
 @dataclass(frozen=True)
