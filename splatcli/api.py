@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.settings import changed
+from stages.formats.output_formats import DEFAULT_FORMATS
 from stages.raster.backends import backend_of_settings
 from stages.raster.draw import render
 from stages.run.listener import Listener
@@ -59,7 +60,7 @@ def process(
         preset: "preview", "standard" or "best".
         listener: receives progress, if given.
         options: fields of the stages' settings; `SHARED_OPTIONS` says which stages get a field that
-            several have.
+            several have. `formats` are written beside those that the run has exported.
 
     Raises SplatError as `splat process` reports it, TypeError for an unknown option, ValueError
     for an unknown preset.
@@ -71,8 +72,9 @@ def process(
     known = {field.name for found in settings.values() for field in fields(found)}
     if unknown := options.keys() - known:
         raise TypeError(f"no stage has the option {', '.join(sorted(unknown))}")
-    settings = {name: changed(found, options_of(name, options)) for name, found in settings.items()}
     pipeline = Pipeline(run_folder, photos)
+    options["formats"] = pipeline.with_exported(options.get("formats", DEFAULT_FORMATS))
+    settings = {name: changed(found, options_of(name, options)) for name, found in settings.items()}
     manifests = pipeline.run(settings, listener=listener)
     return Scene(
         run_folder=Path(run_folder),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from splatcli import console
 from stages.base.errors import RunFolderError, SplatError, UsageError
 from stages.run import results, runfolder
 from stages.run.pipeline import Pipeline
@@ -63,7 +64,7 @@ def load_target(
         strict: whether a value that is not finite makes a file unreadable.
         antialias: of a run, see `results.newest_splats`.
 
-    Raises SplatError.
+    Prints a warning if stages of the run are out of date. Raises SplatError.
     """
     if target is not None and target.is_file():
         return results.read_file(target, strict), None
@@ -75,4 +76,12 @@ def load_target(
             hint="Check the path.",
         )
     pipeline = Pipeline(find_run_folder(target))
-    return results.newest_splats(pipeline, antialias), pipeline
+    splats = results.newest_splats(pipeline, antialias)
+    if stale := results.out_of_date(pipeline):
+        console.warn(
+            f"Warning: {' and '.join(dict.fromkeys(stale.values()))} ran again since "
+            f"{', '.join(stale)} did. These are the splats of "
+            f"{results.newest_stage_with_splats(pipeline)}; `splat process {pipeline.run_folder}` "
+            "renews the rest."
+        )
+    return splats, pipeline

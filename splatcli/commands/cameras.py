@@ -99,6 +99,7 @@ def _model_of_run(run: Path) -> Path:
             wanted="A run in which `sfm` has finished.",
             hint="Run `splat process` to go on.",
         )
+    pipeline.check_outputs(("sfm",), pictures=False)
     return pipeline.stage_folder("sfm") / "colmap"
 
 

@@ -112,6 +112,8 @@ def _about_file(path: Path, count: int) -> dict[str, Any]:
 def _about_run(pipeline: Pipeline) -> dict[str, Any]:
     name = results.newest_stage_with_splats(pipeline)
     facts: dict[str, Any] = {"run": str(pipeline.run_folder), "splats_from": name}
+    if stale := results.out_of_date(pipeline):
+        facts["out_of_date"] = list(stale)
     if pipeline.manifest("sfm") is not None:
         reconstruction = pipeline.load("sfm")
         facts["photographs"] = len(reconstruction.views)

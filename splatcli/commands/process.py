@@ -39,6 +39,8 @@ def process(
     pipeline = distributed(Pipeline(run_folder, photos), cluster)
     given = options.given_only(given)
     view, preset = given.pop("view", False), given.pop("preset", None)
+    if "formats" in given:
+        given["formats"] = pipeline.with_exported(given["formats"])
     is_known = runfolder.is_run_folder(run_folder)
     settings = run_settings.combined(run_settings.recorded(pipeline), given, preset)
     sfm = settings["sfm"]
@@ -92,7 +94,7 @@ def _run_stage(name: str, pipeline: Pipeline, given: Mapping[str, Any]) -> None:
     given = options.given_only(given)
     preset, view = given.pop("preset", None), given.pop("view", False)
     if "formats" in given:
-        given["formats"] = _with_exported(pipeline, given["formats"])
+        given["formats"] = pipeline.with_exported(given["formats"])
     settings = run_settings.combined({name: base[name]}, given, preset)
     if name == "export":  # `quantise` may have to fine-tune for the formats
         changes: dict[str, Any] = {
@@ -113,13 +115,6 @@ def _run_stage(name: str, pipeline: Pipeline, given: Mapping[str, Any]) -> None:
         may_run=after_training if name in after_training else (name,),
         view=view,
     )
-
-
-def _with_exported(pipeline: Pipeline, formats: Collection[str]) -> tuple[str, ...]:
-    """The given formats after those that were exported before, which stay."""
-    manifest = pipeline.manifest("export")
-    earlier = manifest.settings.get("formats", ()) if manifest is not None else ()
-    return tuple(dict.fromkeys((*earlier, *formats)))
 
 
 def _run(

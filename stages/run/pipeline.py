@@ -29,6 +29,8 @@ from stages.run.workspace import Layout
 
 __all__ = ["Pipeline", "Step"]
 
+_PICTURES = (".jpg", ".png")  # no stage's `load` opens these
+
 
 class Pipeline:
     """The stages over one run folder.
@@ -60,9 +62,11 @@ class Pipeline:
         return Manifest.read(self.stage_folder(name))
 
     def load(self, name: str) -> Any:
-        """The output of a finished stage. Raises SplatError (stage-not-finished)."""
+        """The output of a finished stage. What `Stage.load` reads is compared with the digests of
+        the manifest. Raises SplatError (stage-not-finished, run-folder-damaged)."""
         if self.manifest(name) is None:
             raise self._not_finished(name, f"{name} has not finished")
+        self.check_outputs((name,), pictures=False)
         return self.layout.stage(name).load(self.stage_folder(name))
 
     def recorded_settings(self, otherwise: Mapping[str, Any] | None = None) -> dict[str, Any]:
@@ -76,6 +80,12 @@ class Pipeline:
         recorded = RunFile.read(self.run_folder)
         return recorded.photographs if recorded else None
 
+    def with_exported(self, formats: Collection[str]) -> tuple[str, ...]:
+        """The given formats after those that the run has exported, which stay."""
+        exported = self.manifest("export")
+        earlier = exported.settings.get("formats", ()) if exported else ()
+        return tuple(dict.fromkeys((*earlier, *formats)))
+
     def busy(self) -> int | None:
         """Id of the process that holds the run folder's lock now, or None."""
         return holder(self.run_folder)
@@ -86,23 +96,34 @@ class Pipeline:
             raise runfolder.missing(self.run_folder)
         return self.plan()
 
-    def check_outputs(self) -> None:
-        """Read all files of all finished stages. Raises SplatError (run-folder-damaged) if one is
-        not as it was written: a fault of the disk may change neither size nor time."""
+    def check_outputs(self, names: Collection[str] | None = None, pictures: bool = True) -> None:
+        """Read all files of finished stages. Raises SplatError (run-folder-damaged) if one is not
+        as it was written: a fault of the disk may change neither size nor time.
+
+        names: of the stages; None for all. pictures: whether pictures are read as well.
+        """
         damaged = {}
         for stage in self.layout.stages:
-            manifest = self.manifest(stage.name)
+            manifest = self.manifest(stage.name) if names is None or stage.name in names else None
             folder = self.stage_folder(stage.name)
-            if manifest and (found := damage(folder, manifest.outputs, read_all=True)):
+            outputs = manifest.outputs if manifest else {}
+            chosen = {
+                file: record
+                for file, record in outputs.items()
+                if pictures or not file.lower().endswith(_PICTURES)
+            }
+            if found := damage(folder, chosen, read_all=True):
                 damaged[folder] = found
         if damaged:
             what = (f"{folder.name}/{change}" for folder in damaged for change in damaged[folder])
+            folders = " and ".join(shlex.quote(str(folder)) for folder in damaged)
             raise RunFolderError(
                 "run-folder-damaged",
                 given=f"In {self.run_folder}, {', '.join(what)}.",
                 wanted="The files as the stages wrote them.",
-                hint=f"Check the disk. Delete {', '.join(map(str, damaged))}; then `splat process "
-                f"{self.run_folder}` makes this again, and what depends on it if it differs.",
+                hint=f"Check the disk. Delete {folders}; then `splat process "
+                f"{shlex.quote(str(self.run_folder))}` makes this again, and what depends on it if "
+                "it differs.",
             )
 
     def plan(self, settings: Mapping[str, Any] | None = None) -> list[Step]:
@@ -204,11 +225,12 @@ class Pipeline:
         stage, settings = step.stage, planner.wanted[step.stage.name]
         space = self.layout.workspace(stage)
         request = planner.request(stage)
+        self.check_outputs(stage.reads)  # the manifest will record the digests of what was read
         resumed = space.begin(request)
         listener.started(stage, step.number, step.reason, resumed)
-        inputs = {name: self.load(name) for name in stage.reads} or {
-            PHOTOS: planner.existing_photos()
-        }
+        inputs = {
+            name: self.layout.stage(name).load(self.stage_folder(name)) for name in stage.reads
+        } or {PHOTOS: planner.existing_photos()}
         if began is not None:
             settings = within_limit(stage.name, settings, time.monotonic() - began)
         return attempt(request, settings, inputs, space, stop, listener)

@@ -16,21 +16,43 @@ from stages.scene import Reconstruction, Splats, View, draw_settings_of
 _STAGES_WITH_SPLATS = ("seed", "train", "prune", "quantise")
 
 
+def out_of_date(pipeline: Pipeline) -> dict[str, str]:
+    """The finished stages that were not made from what the run folder holds now, each with the
+    stage that was made again since. Raises SplatError for a damaged manifest."""
+    stale: dict[str, str] = {}
+    digests: dict[str, str] = {}
+    for stage in pipeline.layout.stages:
+        manifest = pipeline.manifest(stage.name)
+        if manifest is None:
+            continue
+        for source in stage.reads:
+            if source in stale:
+                stale.setdefault(stage.name, stale[source])
+            elif manifest.inputs.get(source) != digests.get(source, manifest.inputs.get(source)):
+                stale.setdefault(stage.name, source)
+        digests[stage.name] = manifest.output_digest
+    return stale
+
+
 def newest_stage_with_splats(pipeline: Pipeline) -> str:
-    """The last finished stage whose output is splats. Raises SplatError (no-splats-yet)."""
+    """The last finished stage whose output is splats and is not out of date. Raises SplatError
+    (no-splats-yet)."""
+    stale = out_of_date(pipeline)
     for name in reversed(_STAGES_WITH_SPLATS):
-        if pipeline.manifest(name) is not None:
+        if name not in stale and pipeline.manifest(name) is not None:
             return name
     raise UsageError(
         "no-splats-yet",
-        given=f"No stage of {pipeline.run_folder} has made splats yet.",
+        given=f"No stage of {pipeline.run_folder} has made splats yet"
+        + "".join(f" from its present {source}" for source in [*stale.values()][:1])
+        + ".",
         wanted="A run in which at least `seed` has finished.",
         hint="Run `splat process` to go on.",
     )
 
 
 def newest_splats(pipeline: Pipeline, antialias: bool = True) -> Splats:
-    """The splats of the last finished stage that has any.
+    """The splats of `newest_stage_with_splats`.
 
     Args:
         pipeline: of the run.
@@ -53,7 +75,7 @@ def reconstruction_of(pipeline: Pipeline) -> Reconstruction:
     """The capture's cameras, as training has refined them. Raises SplatError
     (stage-not-finished)."""
     found: Reconstruction = pipeline.load("sfm")
-    if pipeline.manifest("train") is None:
+    if pipeline.manifest("train") is None or "train" in out_of_date(pipeline):
         return found
     return found.with_cameras(pipeline.load("train").cameras)
 
@@ -61,34 +83,30 @@ def reconstruction_of(pipeline: Pipeline) -> Reconstruction:
 def final_splats(pipeline: Pipeline) -> Splats:
     """The splats of a finished run, whose stages were made from each other as they lie there.
 
-    Raises SplatError (stage-not-finished, run-half-anew).
+    Raises SplatError (stage-not-finished, run-half-anew, run-folder-damaged).
     """
-    digests: dict[str, str] = {}
+    pipeline.check_outputs()  # the caller reads pictures, too
+    stale = out_of_date(pipeline)
     for name in ("sfm", *_STAGES_WITH_SPLATS):
-        manifest = pipeline.manifest(name)
-        if manifest is None:
+        if pipeline.manifest(name) is None:
             pipeline.load(name)  # raises stage-not-finished
-            raise AssertionError(name)
-        for source, digest in digests.items():
-            if manifest.inputs.get(source, digest) != digest:
-                raise UsageError(
-                    "run-half-anew",
-                    given=f"In {pipeline.run_folder}, {source} was made again, and {name} was not.",
-                    wanted="A run whose stages belong together.",
-                    hint="Run `splat process` to finish it.",
-                )
-        digests[name] = manifest.output_digest
+        if name in stale:
+            raise UsageError(
+                "run-half-anew",
+                given=f"In {pipeline.run_folder}, {stale[name]} was made again, and {name} was "
+                "not.",
+                wanted="A run whose stages belong together.",
+                hint="Run `splat process` to finish it.",
+            )
     splats: Splats = pipeline.load("quantise").splats
     return splats
 
 
 def exported_formats(pipeline: Pipeline) -> dict[str, dict[str, Any]]:
-    """The figures of each exported file by format; empty if export has not finished, or exported
-    other splats than quantise has now."""
-    quantised, exported = pipeline.manifest("quantise"), pipeline.manifest("export")
-    if quantised is None or exported is None:
-        return {}
-    if exported.inputs.get("quantise") != quantised.output_digest:
+    """The figures of each exported file by format; empty if export has not finished, or is out
+    of date."""
+    exported = pipeline.manifest("export")
+    if exported is None or "export" in out_of_date(pipeline):
         return {}
     return dict(exported.metrics.get("formats", {}))
 

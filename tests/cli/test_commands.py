@@ -6,16 +6,19 @@ import errno
 import json
 import os
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
-from splatcli import console
+from splatcli import api, console
 from stages.base.distribution import NAME, VERSION
 from stages.base.errors import Interrupted, SplatError
 from stages.raster import torch_device
 from stages.raster.gpu import device as gpu
+from stages.run import results
 from stages.run.lock import locked
+from stages.run.pipeline import Pipeline
 from tests.cameras.drawn import nerfstudio as drawn_transforms
 from tests.cameras.models import example
 
@@ -71,11 +74,29 @@ def test_process_twice_does_nothing(splat) -> None:
     assert [e["stage"] for e in events(result) if e["event"] == "skipped"] == list(STAGES)
 
 
-def test_exporting_one_more_format_keeps_those_that_are_there(splat) -> None:
+@pytest.mark.parametrize("again", ["export", "process", "python"])
+def test_exporting_one_more_format_keeps_those_that_are_there(splat, again: str) -> None:
     splat("process", "photos", "--format", "ply")
-    splat("export", "--format", "glb")
+    if again == "python":
+        with suppress(Exception):  # the pretended outputs cannot be loaded
+            api.process(Path("photos"), Path("run"), formats=("glb",))
+    else:
+        splat(*(again, "run", "--format", "glb"))
     manifest = json.loads(Path("run/7-export/manifest.json").read_text())
     assert manifest["settings"]["formats"] == ["ply", "glb"]
+
+
+def test_newest_splats_are_made_from_what_lies_there(splat) -> None:
+    splat("process", "photos")
+    run = Pipeline(Path("run"))
+    assert results.newest_stage_with_splats(run) == "quantise"
+    splat("prune", "run", "--max-splats", "107000")
+    assert results.newest_stage_with_splats(run) == "prune"
+    assert results.out_of_date(run) == {"quantise": "prune", "export": "prune"}
+    splat("sfm", "run", "--max-features", "1000")
+    with pytest.raises(SplatError, match="from its present sfm") as error:
+        results.newest_stage_with_splats(run)
+    assert error.value.code == "no-splats-yet"
 
 
 def test_verbose_writes_what_a_bug_report_needs(splat, pretend) -> None:

@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -30,7 +31,7 @@ from stages.run.pipeline import Pipeline
 from stages.run.runfile import RunFile
 from stages.run.runfolder import is_run_folder
 from stages.scene.storage import load_splats
-from tests.run.fakes import CopySettings, CountSettings, fake_stages, photographs
+from tests.run.fakes import CopySettings, CountSettings, SignSettings, fake_stages, photographs
 
 
 class Heard(Listener):
@@ -197,10 +198,7 @@ def test_flipped_bit_of_the_same_size_and_time_is_found_by_reading_all(
     finished: Pipeline, run_folder: Path
 ) -> None:
     finished.check_outputs()
-    path = run_folder / "2-count" / "count.txt"
-    stat = path.stat()
-    path.write_bytes(bytes([path.read_bytes()[0] ^ 1]) + path.read_bytes()[1:])
-    os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+    flip_bit(run_folder / "2-count" / "count.txt")
     assert not any(step.will_run for step in finished.plan())
     with pytest.raises(SplatError) as error:
         finished.check_outputs()
@@ -213,9 +211,113 @@ def test_flipped_bit_of_the_same_size_and_time_is_found_by_reading_all(
     finished.check_outputs()
 
 
+def flip_bit(path: Path) -> None:
+    """As a fault of the disk does: size and time stay."""
+    stat, content = path.stat(), path.read_bytes()
+    path.write_bytes(bytes([content[0] ^ 1]) + content[1:])
+    os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+
+
+def test_flipped_bit_is_not_read_by_the_next_stage_and_the_printed_repair_helps(
+    finished: Pipeline, run_folder: Path
+) -> None:
+    right = finished.load("sign")
+    flip_bit(run_folder / "2-count" / "count.txt")
+    other = {"sign": SignSettings(names=("c",))}
+    for use in (lambda: finished.run(other), lambda: finished.load("count")):
+        with pytest.raises(SplatError) as error:
+            use()
+        assert error.value.code == "run-folder-damaged"
+        assert "2-count/count.txt changed" in error.value.given
+        assert f"Delete {run_folder / '2-count'}" in error.value.hint
+    assert finished.load("sign") == right  # the refused run made nothing
+    shutil.rmtree(run_folder / "2-count")
+    finished.run(other)
+    assert finished.load("sign") == "42000 c"
+
+
+def test_flipped_bit_of_a_picture_is_found_by_the_stage_that_opens_it(
+    photos: Path, run_folder: Path
+) -> None:
+    def copy(inputs, settings, folder, report) -> None:
+        (folder / "text").mkdir()
+        (folder / "text" / "all.txt").write_text("onetwo")
+        (folder / "a.jpg").write_text("a picture")
+
+    pipeline = Pipeline(run_folder, photos, fake_stages(copy=copy))
+    pipeline.run()
+    flip_bit(run_folder / "1-copy" / "a.jpg")
+    assert pipeline.load("copy") == "onetwo"  # which opens no picture
+    with pytest.raises(SplatError) as error:
+        pipeline.run({"count": CountSettings(iterations=5)})
+    assert "1-copy/a.jpg changed" in error.value.given
+
+
 def test_extra_file_beside_the_outputs_does_no_harm(finished: Pipeline, run_folder: Path) -> None:
     (run_folder / "3-sign" / "thumbnail.png").write_text("a viewer left this")
     assert ran(finished) == []
+
+
+def test_files_of_others_in_an_output_survive_its_replacement(
+    finished: Pipeline, run_folder: Path
+) -> None:
+    export = run_folder / "3-sign"
+    (export / "mine").mkdir()
+    (export / "half.ply").write_text("edited")
+    (export / "mine" / "notes.txt").write_text("notes")
+    (export / "signed.txt").write_text("edited by hand")
+    for names in (("c",), ("d",)):
+        warnings = finished.run({"sign": SignSettings(names=names)})[-1].warnings
+        assert warnings == [] if names == ("d",) else warnings[0][0] == "run-file-kept"
+        assert (export / "half.ply").read_text() == "edited"
+        assert (export / "mine" / "notes.txt").read_text() == "notes"
+        assert (export / "signed.txt").read_text() == f"42000 {names[0]}"
+        assert (export / "kept" / "signed.txt").read_text() == "edited by hand"
+    assert ran(finished) == []
+    assert sorted(p.name for p in run_folder.glob(".*")) == [".lock"]
+
+
+def test_file_of_others_under_a_name_that_the_stage_needs_later_is_kept(
+    photos: Path, run_folder: Path
+) -> None:
+    def sign(inputs, settings, folder, report) -> None:
+        for name in settings.names:
+            (folder / name).write_text("splat's")
+
+    pipeline = Pipeline(run_folder, photos, fake_stages(sign=sign))
+    pipeline.run()
+    (run_folder / "3-sign" / "c").write_text("mine")
+    warnings = pipeline.run({"sign": SignSettings(names=("a", "c"))})[-1].warnings
+    assert warnings[0][0] == "run-file-kept"
+    assert (run_folder / "3-sign" / "c").read_text() == "splat's"
+    assert (run_folder / "3-sign" / "kept" / "c").read_text() == "mine"
+    assert not (run_folder / "3-sign" / "b").exists()  # splat's own
+
+
+@pytest.mark.parametrize("renames", range(8))
+def test_files_of_others_survive_a_kill_at_every_rename(
+    finished: Pipeline, run_folder: Path, monkeypatch: pytest.MonkeyPatch, renames: int
+) -> None:
+    export, rename = run_folder / "3-sign", Path.rename
+    (export / "half.ply").write_text("edited")
+    (export / "signed.txt").write_text("by hand")
+    left = iter([True] * renames)
+
+    def dying(self: Path, target: Path) -> Path:
+        if not next(left, False):
+            raise KeyboardInterrupt
+        return rename(self, target)
+
+    with monkeypatch.context() as patch, suppress(KeyboardInterrupt):
+        patch.setattr(Path, "rename", dying)
+        finished.run({"sign": SignSettings(names=("c",))})
+    finished.run({"sign": SignSettings(names=("c",))})
+    assert (export / "half.ply").read_text() == "edited"
+    assert (export / "kept" / "signed.txt").read_text() == "by hand"
+    assert (export / "signed.txt").read_text() == "42000 c"
+    assert {p.name for p in export.iterdir()} == {
+        *("half.ply", "kept", "signed.txt", "manifest.json")
+    }
 
 
 @pytest.mark.parametrize("text", [None, "", "{", '{"schema": 2}'])
