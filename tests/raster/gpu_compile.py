@@ -1,12 +1,14 @@
 """Compiles every kernel for a GPU that is not here, and reads from the object what it would take.
 
-`python -m tests.raster.gpu_compile cuda:90` prints {kernel: {registers, spills, shared}} as JSON.
+`python -m tests.raster.gpu_compile cuda:90` prints {kernel: {registers, spills, shared, cpu_s}} as
+JSON: all that a run compiles, so a kernel that depends on the SH degree is there for each.
 """
 
 from __future__ import annotations
 
 import json
 import re
+import resource
 import subprocess
 import sys
 import tempfile
@@ -30,12 +32,16 @@ POINTERS = {
     **dict.fromkeys(("target",), "*u8"),
     **dict.fromkeys(("tile_of",), SHORTS),
 }
-WHOLE = ("n", "width", "height", "tiles_x", "tiles", "capacity", "entries", "room")
+WHOLE = (
+    *("n", "width", "height", "tiles_x", "tiles", "capacity", "entries", "room"),
+    *("columns", "used", "active", "largest_step"),
+)
 REALS = ("red", "green", "blue", "weight", "unit", "ndc_x", "ndc_y")
-SCENE = {"COLUMNS": 64, "STORED": 16, "COEFFICIENTS": 16, "SMOOTH": False, "ANTIALIAS": False}
-SIZES = {"TILE": 16, "BLOCK": 128, "REAL": tl.float64, "OUT_COLUMNS": 64, "BITS": 20}
+SCENE = {"COEFFICIENTS": 16, "SMOOTH": False, "ANTIALIAS": False}
+SIZES = {"TILE": 16, "BLOCK": 128, "REAL": tl.float64}
 KERNELS: tuple[tuple[Any, dict[str, Any], dict[str, Any]], ...] = (
     (project.project_kernel, {}, {}),
+    (project.colour_kernel, {}, {}),
     (lists.count_kernel, {}, {"enable_fp_fusion": False}),
     (lists.entries_kernel, {}, {"enable_fp_fusion": False}),
     (lists.ties_kernel, {}, {}),
@@ -43,13 +49,17 @@ KERNELS: tuple[tuple[Any, dict[str, Any], dict[str, Any]], ...] = (
     (blend.blend_gradient_kernel, {}, {"num_warps": 1}),
     (blend.contribution_kernel, {}, {"num_warps": 1}),
     (gradients.sum_kernel, {"WIDTH": 9, "BLOCK": 4, "LANES": 8}, {"num_warps": 1}),
+    (gradients.colour_gradient_kernel, {}, {}),
     (gradients.splat_gradient_kernel, {}, {}),
     (gpu_kernels.rows_kernel, {"BLOCK": 256}, {}),
     (gpu_kernels.similarity_kernel, {"BLOCK": 256}, {}),
     (gpu_kernels.slope_rows_kernel, {"BLOCK": 256}, {}),
     (gpu_kernels.loss_gradient_kernel, {"BLOCK": 256}, {}),
-    (gpu_kernels.adam_kernel, {"BLOCK": 16, "ACTIVE": 5, "WIDTH": 64}, {}),
+    (gpu_kernels.adam_kernel, {"BLOCK": 16, "COLUMNS": 64, "WIDTH": 64}, {}),
 )
+
+
+BY_DEGREE = (project.colour_kernel, gradients.colour_gradient_kernel)
 
 
 def target_of(name: str) -> GPUTarget:
@@ -69,17 +79,20 @@ def compiled(kernel: Any, constants: dict[str, Any], options: dict[str, Any], ta
         if parameter.is_constexpr:
             signature[name], values[(at,)] = "constexpr", known[name]
         elif name in WHOLE:
+            # otherwise 1 and multiples of 16 are compiled anew
+            assert parameter.do_not_specialize, (kernel.__name__, name)
             signature[name] = "i32"
         elif name in REALS or name.startswith("rate_"):
             signature[name] = "fp32"
         else:
             signature[name] = POINTERS.get(name, FLOATS)
-            attributes[(at,)] = [["tt.divisibility", 16]]
+            if not parameter.do_not_specialize_on_alignment:
+                attributes[(at,)] = [["tt.divisibility", 16]]
     source = ASTSource(kernel, signature, values, attributes)
     return triton.compile(source, target=target_of(target), options=options)
 
 
-def resources(made: Any) -> dict[str, int]:
+def resources(made: Any) -> dict[str, float]:
     """{registers, spills (bytes of local memory), shared (bytes)} of a compiled kernel."""
     shared = int(made.metadata.shared)
     if "cubin" in made.asm:
@@ -98,7 +111,7 @@ def resources(made: Any) -> dict[str, int]:
     }
 
 
-def _of_cubin(cubin: bytes) -> dict[str, int]:
+def _of_cubin(cubin: bytes) -> dict[str, float]:
     tool = Path(triton.__file__).parent / "backends/nvidia/bin/cuobjdump"
     with tempfile.NamedTemporaryFile(suffix=".cubin") as file:
         file.write(cubin)
@@ -111,10 +124,25 @@ def _of_cubin(cubin: bytes) -> dict[str, int]:
     return {"registers": numbers["REG"], "spills": numbers["STACK"] + numbers["LOCAL"]}
 
 
+def cpu_s() -> float:
+    """Of this process and of the assemblers that it ran."""
+    both = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    return sum(used.ru_utime + used.ru_stime for used in map(resource.getrusage, both))
+
+
 def main(target: str) -> None:
     found = {}
-    for kernel, constants, options in KERNELS:
-        found[kernel.__name__] = resources(compiled(kernel, constants, options, target))
+    kernels = {kernel.__name__: (kernel, *rest) for kernel, *rest in KERNELS}
+    for kernel in BY_DEGREE:
+        for degree in range(3):
+            how = {"COEFFICIENTS": (degree + 1) ** 2}
+            kernels[f"{kernel.__name__}, degree {degree}"] = (kernel, how, {})
+    with tempfile.TemporaryDirectory() as folder:
+        triton.knobs.cache.dir = folder
+        for name, (kernel, constants, options) in kernels.items():
+            before = cpu_s()
+            made = compiled(kernel, constants, options, target)
+            found[name] = {"cpu_s": round(cpu_s() - before, 2), **resources(made)}
     print(json.dumps(found))
 
 

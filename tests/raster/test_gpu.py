@@ -36,6 +36,7 @@ from tests.tolerances import FLOAT32_GRADIENT, FLOAT32_IMAGE
 pytestmark = pytest.mark.gpu
 SETTINGS = RasterSettings(background=(0.2, 0.5, 0.9))
 TARGETS = ("cuda:80", "cuda:90", "cuda:100", "hip:gfx942")
+COMPILATION_CPU_S = 20.0  # of all kernels and degrees; 12 were measured, 190 before
 # Rows of the extremes table that the interpreter does in a second or two. On a GPU all are done.
 LIGHT_ROWS = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 13, 14, 15, 22, 24, 31)
 
@@ -161,7 +162,9 @@ def test_every_kernel_compiles_within_its_registers(target):
     )
     assert process.returncode == 0, process.stderr[-2000:]
     found = json.loads(process.stdout)
-    assert len(found) == 14
+    assert len(found) == 22
+    # a first run waits for it
+    assert sum(taken["cpu_s"] for taken in found.values()) <= COMPILATION_CPU_S
     for name, taken in found.items():
         assert taken["spills"] <= (0 if name.startswith("blend") else 16), (name, taken)
         assert taken["shared"] <= 16 * 1024, (name, taken)

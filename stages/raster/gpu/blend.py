@@ -37,6 +37,7 @@ PATIENCE = tl.constexpr(16)  # entries between two checks whether a tile is fini
 # Results of the backward pass for a splat: see `cpu.blend.SUMS`.
 S_U, S_T, S_UU, S_TT, S_UT, S_1, S_RED = (tl.constexpr(k) for k in range(7))
 SUMS = tl.constexpr(9)
+SIZES = ("width", "height", "tiles_x")  # one compiled kernel for all
 
 
 @inner
@@ -78,7 +79,7 @@ def alpha_of(record, frame, i, j):
     return tl.exp2(tl.fma(-across, across, tl.fma(-along, along, level)))
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def blend_kernel(
     records,
     members,
@@ -158,7 +159,7 @@ def origin_frame(record, x, y):
     return major - tl.load(record + ORIGIN), t - tl.load(record + SLOPE_LO) * major
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def blend_gradient_kernel(
     records,
     members,
@@ -219,7 +220,7 @@ def blend_gradient_kernel(
         tl.store(out + S_1, sum_of(v, 0))
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def contribution_kernel(
     records,
     members,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import triton.language as tl
 
 from stages.raster import camera_row, definition
-from stages.raster.gpu.inner import inner
+from stages.raster.gpu.inner import inner, sum_of
 from stages.raster.sh import C0, C1, C2, C3
 
 SHIFT, NEAR = tl.constexpr(camera_row.T), tl.constexpr(camera_row.NEAR)
@@ -29,6 +29,7 @@ SCALE_MAX = tl.constexpr(definition.SCALE_MAX)
 QUATERNION_MIN = tl.constexpr(definition.QUATERNION_MIN)
 LARGEST = tl.constexpr(3.4028234663852886e38)
 LOG2E = tl.constexpr(1.4426950408889634)
+GROUP = tl.constexpr(16)  # columns of a row that are looked at together
 
 K0, K1 = tl.constexpr(C0), tl.constexpr(C1)
 K20, K21, K22 = (tl.constexpr(c) for c in C2)
@@ -53,14 +54,17 @@ def is_finite(x):
 
 
 @inner
-def drawable(rows, at, mask, smoothing, i, STORED: tl.constexpr, SMOOTH: tl.constexpr):
-    """Whether a row can be drawn at all: see `reference.drawable`. Its columns are float32."""
-    good = mask
-    for k in tl.static_range(SH + 3 * STORED):
-        value = tl.load(rows + at + k, mask=mask, other=0.0)
-        good = good & is_finite(value)
-        if (k >= LOG_SCALE) & (k < OPACITY):
-            good = good & (value <= LOG_SCALE_MAX)
+def drawable(rows, at, mask, smoothing, i, used, SMOOTH: tl.constexpr):
+    """Whether a row can be drawn at all: see `reference.drawable`. Its `used` columns are float32;
+    GROUP neighbours are read at once, by neighbouring lanes."""
+    wrong, k = (at * 0).to(tl.int32), tl.expand_dims(tl.arange(0, GROUP), 0)
+    here, some = tl.expand_dims(rows + at, 1), tl.expand_dims(mask, 1)
+    for first in range(0, used, GROUP):
+        value = tl.load(here + (first + k), mask=some & (first + k < used), other=0.0)
+        wrong += sum_of(tl.where(is_finite(value), 0, 1), 1)
+    good = mask & (wrong == 0)
+    for axis in tl.static_range(3):
+        good = good & (tl.load(rows + at + LOG_SCALE + axis, mask=mask, other=0.0) <= LOG_SCALE_MAX)
     q0, q1, q2, q3 = quaternion(rows, at, mask, tl.float64)  # the bound is not exact in float32
     good = good & (largest4(q0, q1, q2, q3) >= QUATERNION_MIN)
     if SMOOTH:

@@ -50,7 +50,7 @@ LARGEST_KEPT = tl.constexpr(3.4e38)  # no gradient becomes infinite
 BRIGHTEST = tl.constexpr(1.0000000200408773e20)  # COLOUR_MAX in float32
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["n", "entries"])
 def sum_kernel(
     raw,
     firsts,
@@ -116,11 +116,26 @@ def rotation_gradient(out, mask, q0, q1, q2, q3, norm, r00, r10, r20, r01, r11, 
     store_gradient(out, ROTATION + 3, mask, (n3 - along * q3) / norm)
 
 
-@inner
-def colour_gradient(
-    cam, rows, at, mask, record, sums, out, COEFFICIENTS: tl.constexpr, REAL: tl.constexpr
+@triton.jit(do_not_specialize=["n", "columns"])
+def colour_gradient_kernel(
+    cam,
+    rows,
+    keys,
+    records,
+    sums,
+    n,
+    columns,
+    out,
+    COEFFICIENTS: tl.constexpr,
+    REAL: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):
-    """SH gradients into `out`; returns what the viewing directions add to the mean's gradient."""
+    """SH gradients of the visible rows into out [n, columns], and into its columns of the mean what
+    the viewing directions add to that. `splat_gradient_kernel` adds the rest."""
+    i = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
+    mask, at = i < n, i * columns
+    mask = mask & (tl.load(keys + i, mask=mask, other=float("inf")) < float("inf"))
+    record, sums, out = records + i * RECORD, sums + i * SUMS, out + at
     x, y, z, distance = direction(cam, rows, at, mask, REAL)
     g_r = shown_colour(record, sums, 0, mask)
     g_g = shown_colour(record, sums, 1, mask)
@@ -140,7 +155,9 @@ def colour_gradient(
             gy += weight * by_y
             gz += weight * by_z
     along = gx * x + gy * y + gz * z
-    return (gx - along * x) / distance, (gy - along * y) / distance, (gz - along * z) / distance
+    store_gradient(out, MEAN, mask, (gx - along * x) / distance)
+    store_gradient(out, MEAN + 1, mask, (gy - along * y) / distance)
+    store_gradient(out, MEAN + 2, mask, (gz - along * z) / distance)
 
 
 @inner
@@ -244,7 +261,7 @@ def shape_gradient(
     return g02 + g0 * deep, g12 + g1 * deep
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["n", "columns"])
 def splat_gradient_kernel(
     cam,
     rows,
@@ -253,23 +270,21 @@ def splat_gradient_kernel(
     records,
     sums,
     n,
+    columns,
     out,
     means2d,
-    COLUMNS: tl.constexpr,
-    OUT_COLUMNS: tl.constexpr,
-    COEFFICIENTS: tl.constexpr,
     SMOOTH: tl.constexpr,
     ANTIALIAS: tl.constexpr,
     REAL: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """out [n, OUT_COLUMNS], means2d [n, 2]: gradients of the visible rows. Other rows and columns
-    beyond those in use are left as they are."""
+    """out [n, columns], means2d [n, 2]: gradients of the visible rows, but for those that
+    `colour_gradient_kernel` left in `out` before. Other rows are left as they are."""
     i = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     mask = i < n
     mask = mask & (tl.load(keys + i, mask=mask, other=float("inf")) < float("inf"))
-    at = i * COLUMNS
-    record, sums, out = records + i * RECORD, sums + i * SUMS, out + i * OUT_COLUMNS
+    at = i * columns
+    record, sums, out = records + i * RECORD, sums + i * SUMS, out + at
     width = (i * 0).to(REAL)
     if SMOOTH:
         width = tl.load(smoothing + i, mask=mask, other=0.0).to(REAL)
@@ -299,7 +314,6 @@ def splat_gradient_kernel(
     g_u, g_v = tl.where(in_u, -g02 * fx / z, 0.0), tl.where(in_v, -g12 * fy / z, 0.0)
     by_x, by_y = (g_x * fx + g_u) / z, (g_y * fy + g_v) / z
     mx, my, mz = turned_back(cam, by_x, by_y, -(g_near + g_u * u + g_v * v) / z, REAL)
-    tx, ty, tz = colour_gradient(cam, rows, at, mask, record, sums, out, COEFFICIENTS, REAL)
-    store_gradient(out, MEAN, mask, mx + tx)
-    store_gradient(out, MEAN + 1, mask, my + ty)
-    store_gradient(out, MEAN + 2, mask, mz + tz)
+    store_gradient(out, MEAN, mask, mx + column(out, 0, mask, MEAN, REAL))
+    store_gradient(out, MEAN + 1, mask, my + column(out, 0, mask, MEAN + 1, REAL))
+    store_gradient(out, MEAN + 2, mask, mz + column(out, 0, mask, MEAN + 2, REAL))

@@ -64,7 +64,7 @@ def row_span(x, y, half_x, half_y, rho, thin, tile_row, width, TILE: tl.constexp
     return first, tl.where(touches, last - first + 1, 0)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["n", "width"])
 def count_kernel(shapes, keys, counts, n, width, TILE: tl.constexpr, BLOCK: tl.constexpr):
     """counts [n] int32: number of tiles that each splat touches, 0 if it is not visible."""
     i = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
@@ -84,7 +84,7 @@ def count_kernel(shapes, keys, counts, n, width, TILE: tl.constexpr, BLOCK: tl.c
     tl.store(counts + i, total, mask=mask)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["n", "tiles_x", "tiles", "width", "capacity", "largest_step"])
 def entries_kernel(
     shapes,
     order,
@@ -94,19 +94,19 @@ def entries_kernel(
     tiles,
     width,
     capacity,
+    largest_step,
     tile_of,
     row_of,
-    BITS: tl.constexpr,
     TILE: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
     """tile_of, row_of [capacity]: the tile and the splat of each entry, splats nearest first; the
     number of tiles beyond the last entry. order [n]: rows, nearest first; ends [n]: of their
-    entries. BITS: enough for n."""
+    entries. largest_step: a power of two above n."""
     e = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     low = e * 0  # the number of splats whose entries end at or before e
-    step = low + (1 << BITS)
-    for _ in tl.static_range(BITS + 1):
+    step = largest_step
+    while step > 0:
         probe = low + step
         inside = probe <= n
         end = tl.load(ends + probe - 1, mask=inside, other=0)
@@ -133,36 +133,34 @@ def entries_kernel(
 
 
 @inner
-def compared(rows, a, b, mask, k, sign, COLUMNS: tl.constexpr):
+def compared(rows, a, b, mask, k, sign, columns):
     """`sign`; where that is 0, the sign of column k of rows a minus column k of rows b."""
-    x = tl.load(rows + a * COLUMNS + k, mask=mask, other=0.0)
-    y = tl.load(rows + b * COLUMNS + k, mask=mask, other=0.0)
+    x = tl.load(rows + a * columns + k, mask=mask, other=0.0)
+    y = tl.load(rows + b * columns + k, mask=mask, other=0.0)
     here = (x > y).to(tl.int32) - (x < y).to(tl.int32)
     return tl.where(sign == 0, here, sign)
 
 
 @inner
-def order_of(rows, a, b, mask, COLUMNS: tl.constexpr, STORED: tl.constexpr):
+def order_of(rows, a, b, mask, columns, used):
     """-1 where rows a come before rows b, 1 where after, 0 where equal: by mean, opacity,
     scales, rotation and SH, as in `reference`."""
     sign = (a * 0).to(tl.int32)
     for k in tl.static_range(3):
-        sign = compared(rows, a, b, mask, MEAN + k, sign, COLUMNS)
+        sign = compared(rows, a, b, mask, MEAN + k, sign, columns)
     if top_of((mask & (sign == 0)).to(tl.int32), 0) > 0:
-        sign = compared(rows, a, b, mask, OPACITY, sign, COLUMNS)
+        sign = compared(rows, a, b, mask, OPACITY, sign, columns)
         for axis in tl.static_range(3):
-            sign = compared(rows, a, b, mask, LOG_SCALE + axis, sign, COLUMNS)
+            sign = compared(rows, a, b, mask, LOG_SCALE + axis, sign, columns)
         for part in tl.static_range(4):
-            sign = compared(rows, a, b, mask, ROTATION + part, sign, COLUMNS)
-        for at in range(3 * STORED):
-            sign = compared(rows, a, b, mask, SH + at, sign, COLUMNS)
+            sign = compared(rows, a, b, mask, ROTATION + part, sign, columns)
+        for at in range(SH, used):
+            sign = compared(rows, a, b, mask, at, sign, columns)
     return sign
 
 
-@triton.jit
-def ties_kernel(
-    keys, order, ordered, rows, n, COLUMNS: tl.constexpr, STORED: tl.constexpr, BLOCK: tl.constexpr
-):
+@triton.jit(do_not_specialize=["n", "columns", "used"])
+def ties_kernel(keys, order, ordered, rows, n, columns, used, BLOCK: tl.constexpr):
     """ordered [n]: `order`, with runs of equal finite keys in the order of the splats' own values.
 
     keys [n]: sorted. A splat moves up by those before it that belong behind it, and down by those
@@ -183,7 +181,7 @@ def ties_kernel(
             tied = tied & (rival >= 0) & (rival < n)
             tied = tied & (tl.load(keys + rival, mask=tied, other=float("inf")) == key)
             rival_row = tl.load(order + rival, mask=tied, other=0)
-            wrong = order_of(rows, rival_row, row, tied, COLUMNS, STORED) * way < 0
+            wrong = order_of(rows, rival_row, row, tied, columns, used) * way < 0
             place += tl.where(tied & wrong, way, 0)
             length += tied.to(tl.int64)
             rival += way

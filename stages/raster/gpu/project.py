@@ -167,8 +167,23 @@ def put_shape(shape, mask, x, y, half_x, half_y, rho, thin, height, TILE: tl.con
     put(shape, S_LAST, mask, tl.floor(last / TILE))
 
 
-@inner
-def put_colour(record, cam, rows, at, mask, COEFFICIENTS: tl.constexpr, REAL: tl.constexpr):
+@triton.jit(do_not_specialize=["n", "columns"])
+def colour_kernel(
+    cam,
+    rows,
+    keys,
+    records,
+    n,
+    columns,
+    COEFFICIENTS: tl.constexpr,
+    REAL: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """The colour in the records of the visible rows: by COEFFICIENTS of their SH coefficients. A
+    kernel of its own, because it alone is compiled for each degree."""
+    i = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
+    at, record, mask = i * columns, records + i * RECORD, i < n
+    mask = mask & (tl.load(keys + i, mask=mask, other=float("inf")) < float("inf"))
     x, y, z, _ = direction(cam, rows, at, mask, REAL)
     red, green, blue = x * 0.0 + 0.5, x * 0.0 + 0.5, x * 0.0 + 0.5
     for k in tl.static_range(COEFFICIENTS):
@@ -181,34 +196,31 @@ def put_colour(record, cam, rows, at, mask, COEFFICIENTS: tl.constexpr, REAL: tl
     put(record, COLOUR + 2, mask, tl.minimum(tl.maximum(blue, 0.0), COLOUR_MAX))
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["n", "columns", "used", "width", "height"])
 def project_kernel(
     cam,
     rows,
     smoothing,
     n,
+    columns,
+    used,
     width,
     height,
     records,
     shapes,
     keys,
     status,
-    COLUMNS: tl.constexpr,
-    STORED: tl.constexpr,
-    COEFFICIENTS: tl.constexpr,
     SMOOTH: tl.constexpr,
     ANTIALIAS: tl.constexpr,
     TILE: tl.constexpr,
     REAL: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Record, shape, key (depth, infinite where not visible) and status of each of n rows.
-
-    rows [n, COLUMNS], with STORED SH coefficients, of which COEFFICIENTS are drawn. smoothing [n].
-    """
+    """Record (but for the colour), shape, key (depth, infinite where not visible) and status of
+    each of n rows. rows [n, columns], of which `used` columns hold parameters. smoothing [n]."""
     i = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
-    mask, at = i < n, i * COLUMNS
-    good = drawable(rows, at, mask, smoothing, i, STORED, SMOOTH)
+    mask, at = i < n, i * columns
+    good = drawable(rows, at, mask, smoothing, i, used, SMOOTH)
     filter_width = (i * 0).to(REAL)
     if SMOOTH:
         filter_width = tl.load(smoothing + i, mask=mask, other=0.0).to(REAL)
@@ -230,7 +242,6 @@ def project_kernel(
     px, py = held(px), held(py)
     record = records + i * RECORD
     put_record(record, shown, px, py, a, b, c, det, opacity, z, width, height)
-    put_colour(record, cam, rows, at, shown, COEFFICIENTS, REAL)
     rho, thin = b / tl.sqrt(a) / tl.sqrt(c), tl.sqrt(det / a / c)
     put_shape(shapes + i * SHAPE, shown, px, py, half_x, half_y, rho, thin, height, TILE)
     tl.store(keys + i, tl.where(shown, z.to(tl.float32), float("inf")), mask=mask)

@@ -20,6 +20,7 @@ from stages.raster.definition import (
     Backward,
     RasterSettings,
     gradient_columns,
+    used_columns,
     with_smoothing,
 )
 from stages.raster.gpu import blend, gradients, lists, project
@@ -40,6 +41,11 @@ class DeviceScene:
 
     def __len__(self) -> int:
         return len(self.rows)
+
+    @property
+    def layout(self) -> tuple[int, int]:
+        """(columns of a row, how many of them hold parameters)."""
+        return self.rows.shape[1], used_columns(self.coefficients)
 
 
 @dataclass(frozen=True)
@@ -135,8 +141,10 @@ class GpuRasteriser:
             v = torch.from_numpy(np.ascontiguousarray(v_image)).to(self.device)
             parameters, means2d = self.gradients(forward.scene, forward.view, forward.drawn, v)
             rows = torch.from_numpy(forward.visible).to(self.device).long()
+            used = gradient_columns(forward.view.coefficients(forward.scene))
             return Backward(
-                forward.visible, parameters[rows].cpu().numpy(), means2d[rows].cpu().numpy()
+                *(forward.visible, parameters[rows, :used].cpu().numpy()),
+                means2d[rows].cpu().numpy(),
             )
 
     def contributions(self, forward: Forward, residual: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -197,14 +205,17 @@ class GpuRasteriser:
         status = torch.empty(n, dtype=torch.int8, **like)
         if n:
             project.project_kernel[self._grid(n)](
-                *(view.cam, scene.rows, scene.smoothing, n, view.width, view.height),
-                *(records, shapes, keys, status),
-                COLUMNS=scene.rows.shape[1],
-                STORED=scene.coefficients,
-                COEFFICIENTS=view.coefficients(scene),
+                *(view.cam, scene.rows, scene.smoothing, n, *scene.layout),
+                *(view.width, view.height, records, shapes, keys, status),
                 SMOOTH=len(scene.smoothing) > 0,
                 ANTIALIAS=view.settings.antialias,
                 TILE=self.tile,
+                REAL=self.real,
+                BLOCK=self.block,
+            )
+            project.colour_kernel[self._grid(n)](
+                *(view.cam, scene.rows, keys, records, n, scene.rows.shape[1]),
+                COEFFICIENTS=view.coefficients(scene),
                 REAL=self.real,
                 BLOCK=self.block,
             )
@@ -215,7 +226,7 @@ class GpuRasteriser:
         last = torch.empty(view.height, view.width, dtype=torch.int32, **like)
         blend.blend_kernel[(self._tiles(view)[2],)](
             *(records, made.members, made.starts, image, transmittance, last),
-            *view.settings.background,
+            *map(float, view.settings.background),
             *(view.width, view.height, self._tiles(view)[0]),
             DEPTHS=depths,
             TILE=self.tile,
@@ -226,22 +237,24 @@ class GpuRasteriser:
     def gradients(
         self, scene: DeviceScene, view: DeviceView, drawn: Drawn, v_image: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """([N, gradient_columns], [N, 2]) of parameters and of means on the picture, of the visible
-        splats; zeros elsewhere. v_image [3, H, W]."""
-        n, coefficients = len(scene), view.coefficients(scene)
+        """([N, columns of the scene], [N, 2]) of parameters and of means on the picture, of the
+        visible splats; zeros elsewhere. v_image [3, H, W]."""
+        n, columns = scene.rows.shape
         like: dict[str, Any] = {"device": self.device}
         raw = torch.zeros(len(drawn.lists.members), blend.SUMS.value, **like)
         self._over_tiles(blend.blend_gradient_kernel, view, drawn, v_image, raw)
         sums = self._summed(raw, drawn.lists, self.real)
-        out = torch.zeros(n, gradient_columns(coefficients), **like)
-        means2d = torch.zeros(n, 2, **like)
+        out, means2d = torch.zeros(n, columns, **like), torch.zeros(n, 2, **like)
         if n:
+            gradients.colour_gradient_kernel[self._grid(n)](
+                *(view.cam, scene.rows, drawn.keys, drawn.records, sums, n, columns, out),
+                COEFFICIENTS=view.coefficients(scene),
+                REAL=self.real,
+                BLOCK=self.block,
+            )
             gradients.splat_gradient_kernel[self._grid(n)](
                 *(view.cam, scene.rows, scene.smoothing, drawn.keys, drawn.records, sums, n),
-                *(out, means2d),
-                COLUMNS=scene.rows.shape[1],
-                OUT_COLUMNS=out.shape[1],
-                COEFFICIENTS=coefficients,
+                *(columns, out, means2d),
                 SMOOTH=len(scene.smoothing) > 0,
                 ANTIALIAS=view.settings.antialias,
                 REAL=self.real,
@@ -276,9 +289,7 @@ class GpuRasteriser:
                 *(shapes, keys, counts, n, view.width), TILE=self.tile, BLOCK=self.block, **plain
             )
             lists.ties_kernel[self._grid(n)](
-                *(by_depth, order, ordered, scene.rows, n),
-                COLUMNS=scene.rows.shape[1],
-                STORED=scene.coefficients,
+                *(by_depth, order, ordered, scene.rows, n, *scene.layout),
                 BLOCK=self.block,
             )
         ends = torch.cumsum(counts[ordered], 0)
@@ -290,8 +301,8 @@ class GpuRasteriser:
         row_of = torch.empty(room, dtype=torch.int32, **like)
         if room and n:
             lists.entries_kernel[self._grid(room)](
-                *(shapes, ordered, ends, n, across, tiles, view.width, room, tile_of, row_of),
-                BITS=n.bit_length(),
+                *(shapes, ordered, ends, n, across, tiles, view.width, room),
+                *(1 << n.bit_length(), tile_of, row_of),
                 TILE=self.tile,
                 BLOCK=self.block,
                 **plain,
@@ -317,7 +328,7 @@ class GpuRasteriser:
                 drawn.transmittance,
                 drawn.last,
             ),
-            *(planes, out, *view.settings.background),
+            *(planes, out, *map(float, view.settings.background)),
             *(view.width, view.height, self._tiles(view)[0]),
             TILE=self.tile,
             num_warps=1,

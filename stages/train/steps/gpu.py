@@ -230,7 +230,7 @@ class GpuStep:
         view_target.ignore_masked(v_image)
         parameters, means2d = self.rasteriser.gradients(scene, view, drawn, v_image)
         if self._own is not None:
-            parameters *= self._own[:, : parameters.shape[1]]
+            parameters *= self._own
         results = torch.stack([loss.double(), drawn.lists.total[0].double()])
         self.skipped += drawn.lists.total > room
         # last, because what needs memory may be repeated
@@ -271,7 +271,8 @@ class GpuStep:
         rates: LearningRates,
         room: int,
     ) -> None:
-        n, columns, out_columns = len(self), self._scene.rows.shape[1], parameters.shape[1]
+        n, columns = self._scene.rows.shape
+        coefficients = view.coefficients(self._scene)
         if n == 0:
             return
         parameters[:, :ROTATION] *= rates.extent
@@ -281,13 +282,12 @@ class GpuStep:
             *(self._scene.rows, self._moment1, self._moment2, self._steps, parameters, means2d),
             *(drawn.keys, self._gradient_sum, self._gradient_count, self._distances),
             self._corrections,
-            *(drawn.lists.total, room, n, rates.means, rates.quaternions, rates.log_scales),
+            *(drawn.lists.total, room, n, gradient_columns(coefficients)),
+            *(active_counts(coefficients), rates.means, rates.quaternions, rates.log_scales),
             *(rates.opacity_logits, rates.sh_dc, rates.sh_rest),
             *(0.5 * view.width / pixels, 0.5 * view.height / pixels),
             COLUMNS=columns,
-            OUT_COLUMNS=out_columns,
-            ACTIVE=active_counts(view.coefficients(self._scene)),
-            WIDTH=triton.next_power_of_2(out_columns),
+            WIDTH=triton.next_power_of_2(columns),
             BLOCK=block,
         )
 

@@ -28,6 +28,7 @@ LAST_CORRECTION = tl.constexpr(len(optimiser.bias_corrections()) - 1)
 ROTATION, LOG_SCALE = tl.constexpr(definition.ROTATION), tl.constexpr(definition.LOG_SCALE)
 OPACITY, SH = tl.constexpr(definition.OPACITY), tl.constexpr(definition.SH)
 SH_REST = tl.constexpr(definition.SH_REST)
+SIZE = ("width", "height")  # one compiled kernel for all
 DEGREE_2, DEGREE_3 = tl.constexpr(used_columns(4)), tl.constexpr(used_columns(9))
 
 
@@ -48,7 +49,7 @@ def pictures(image, target, means, unit, at, mask, width, height):
     return tl.where(mask, value - level, 0.0), tl.where(mask, value - wanted, 0.0)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZE)
 def rows_kernel(image, target, means, unit, maps, width, height, BLOCK: tl.constexpr):
     """maps [4, 3, H, W]: means of the picture and of the difference over a row's window, both
     pictures' variances added, the difference's."""
@@ -71,7 +72,7 @@ def rows_kernel(image, target, means, unit, maps, width, height, BLOCK: tl.const
     tl.store(maps + 3 * plane + at, other - m_d * m_d, mask=mask)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZE)
 def similarity_kernel(maps, means, slopes, sums, width, height, BLOCK: tl.constexpr):
     """slopes [3, 3, H, W]: see `loss_kernels._similarity_row`. sums [programs]: of SSIM."""
     at, _, y, mask = place(width, height, BLOCK)
@@ -107,7 +108,7 @@ def similarity_kernel(maps, means, slopes, sums, width, height, BLOCK: tl.conste
     tl.store(sums + tl.program_id(0), sum_of(tl.where(mask, c * d * inverse, 0.0), 0))
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZE)
 def slope_rows_kernel(slopes, filtered, width, height, BLOCK: tl.constexpr):
     """filtered [3, 3, H, W]: the slopes over a row's window."""
     at, x, _, mask = place(width, height, BLOCK)
@@ -121,7 +122,7 @@ def slope_rows_kernel(slopes, filtered, width, height, BLOCK: tl.constexpr):
         tl.store(filtered + which * plane + at, total, mask=mask)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZE)
 def loss_gradient_kernel(
     image, target, means, unit, filtered, v_image, sums, weight, width, height, BLOCK: tl.constexpr
 ):
@@ -149,7 +150,10 @@ def group_of(k):
     return group + (k >= DEGREE_3).to(tl.int32) + (k == OPACITY).to(tl.int32)
 
 
-@triton.jit
+@triton.jit(
+    do_not_specialize=["room", "n", "used", "active"],
+    do_not_specialize_on_alignment=["total"],
+)
 def adam_kernel(
     rows,
     moment1,
@@ -165,6 +169,8 @@ def adam_kernel(
     total,
     room,
     n,
+    used,
+    active,
     rate_means,
     rate_rotation,
     rate_scale,
@@ -174,13 +180,12 @@ def adam_kernel(
     ndc_x,
     ndc_y,
     COLUMNS: tl.constexpr,
-    OUT_COLUMNS: tl.constexpr,
-    ACTIVE: tl.constexpr,
     WIDTH: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Move the visible splats: see `optimiser.adam_step`. rows, moments [n, COLUMNS]; gradients
-    [n, OUT_COLUMNS]; the first ACTIVE counts take part. WIDTH: a power of two that holds a row.
+    """Move the visible splats: see `optimiser.adam_step`. rows, moments and gradients [n, COLUMNS],
+    of which `used` columns and the first `active` counts take part. WIDTH: a power of two that
+    holds a row.
 
     Nothing moves where the lists held more entries (total) than there was room for.
     """
@@ -188,8 +193,9 @@ def adam_kernel(
     k = tl.arange(0, WIDTH)
     moved = (i < n) & (tl.load(total) <= room)
     moved = moved & (tl.load(keys + i, mask=moved, other=float("inf")) < float("inf"))
-    there = moved[:, None] & (k < OUT_COLUMNS)[None, :]
-    g = tl.load(gradients + i[:, None] * OUT_COLUMNS + k[None, :], mask=there, other=0.0)
+    there = moved[:, None] & (k < used)[None, :]
+    at = i[:, None] * COLUMNS + k[None, :]
+    g = tl.load(gradients + at, mask=there, other=0.0)
     wrong = tl.where(tl.abs(g) <= LARGEST, 0, 1)
     moved = moved & (sum_of(wrong, 1) == 0)
     there = there & moved[:, None]
@@ -197,10 +203,9 @@ def adam_kernel(
     # every lane reads the counts before any writes one
     t = tl.load(steps + i[:, None] * COUNTS + group[None, :], mask=there, other=0) + 1
     tl.debug_barrier()
-    first = there & (leads(k) & (group < ACTIVE))[None, :]
+    first = there & (leads(k) & (group < active))[None, :]
     tl.store(steps + i[:, None] * COUNTS + group[None, :], t, mask=first)
     t = tl.minimum(tl.maximum(t, 1), LAST_CORRECTION)
-    at = i[:, None] * COLUMNS + k[None, :]
     m = BETA1 * tl.load(moment1 + at, mask=there, other=0.0) + REST1 * g
     v = BETA2 * tl.load(moment2 + at, mask=there, other=0.0) + REST2 * g * g
     tl.store(moment1 + at, m, mask=there)

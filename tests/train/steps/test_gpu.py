@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import torch
 pytest.importorskip("triton")
 
 from stages.raster.definition import MemoryFull, RasterSettings, splat_arrays
+from stages.raster.gpu import device
 from stages.raster.gpu.rasteriser import GpuRasteriser
 from stages.raster.reference_rasteriser import ReferenceRasteriser
 from stages.scene import IGNORE, TRANSPARENT
@@ -137,6 +139,36 @@ def test_a_steady_step_never_waits_for_the_device(seen, dropout, monkeypatch):
     assert not waits
     made.model()
     assert waits["cpu"] > 0  # the counter counts
+
+
+@pytest.mark.skipif(not device.interpreted(), reason="a device refuses other numbers itself")
+def test_kernels_are_given_plain_numbers_and_aligned_tensors(monkeypatch):
+    """A device takes no NumPy numbers, and a tensor at an odd address would compile a kernel anew,
+    but for `adam_kernel`'s `total`."""
+    import triton.language as tl
+    from triton.runtime.interpreter import GridExecutor
+
+    made, execute, seen = stepper(), GridExecutor.__call__, set()
+
+    def checked(self, *given, **named):
+        seen.add(self.fn.__name__)
+        for name, value in (*zip(self.arg_names, given, strict=False), *named.items()):
+            if isinstance(value, torch.Tensor):
+                assert name == "total" or value.data_ptr() % 16 == 0, (self.fn.__name__, name)
+            else:
+                allowed = (int, float, bool, tl.dtype)
+                assert type(value) in allowed, (self.fn.__name__, name, type(value))
+        return execute(self, *given, **named)
+
+    monkeypatch.setattr(GridExecutor, "__call__", checked)
+    background: Any = (np.float32(0.5), 0, np.float64(1.0))
+    settings = replace(SETTINGS, background=background)
+    for photograph in (level(), masked(TRANSPARENT, (0.3, -0.2, 0.1))):
+        made.step(StepInput(photograph, settings, RATES, smooth=True, dropout=Dropout(5, 7)))
+    rasteriser, arrays = made.rasteriser, made.model().arrays
+    forward = rasteriser.forward(arrays, camera(40, 30), settings, depths=True)
+    rasteriser.contributions(forward, np.zeros((3, 30, 40), np.float32))
+    assert len(seen) == 16
 
 
 @pytest.mark.slow
