@@ -3,6 +3,6 @@
 Depth maps drawn from the splats -> truncated signed distance field -> marching cubes ->
 simplification.
 
-In this order: `collision_mesh` calls `depth_maps`, `fuse` (with `fuse_kernels`), `extract`, and
-measures the result by `distance`.
+In this order: `collision_mesh` calls `depth_maps`, `fuse` (with `fuse_kernels`), `extract` and
+`vertex_colours`.
 """

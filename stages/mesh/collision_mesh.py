@@ -6,12 +6,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from stages.base.errors import Interrupted
 from stages.base.stage import Report
 from stages.mesh import depth_maps, extract, fuse
 from stages.mesh.depth_maps import DepthMap
-from stages.mesh.distance import distances_to_mesh
 from stages.mesh.vertex_colours import colour_vertices
 from stages.raster.draw import raster_settings_of
 from stages.scene import Reconstruction, Splats, split_held_out
@@ -19,6 +20,7 @@ from stages.scene.mesh import Mesh
 
 _COVERED_VOXELS = 2.0  # largest distance of a covered surface from the mesh
 _SAMPLES = 200_000  # pixels that the covered share is measured on
+_SAMPLES_PER_VOXEL = 4  # random points of the mesh for each face of a voxel that it fills
 _LOW_COVERAGE = 0.7
 
 
@@ -108,5 +110,14 @@ def _covered(mesh: Mesh, maps: list[DepthMap], voxel: float) -> float:
     step = max(1, pixels // _SAMPLES)
     solid = [replace(found, weight=(found.depth > 0).astype(np.float32)) for found in maps]
     places = np.concatenate([found.points(step) for found in solid])
-    near = distances_to_mesh(places, mesh, voxel) <= _COVERED_VOXELS * voxel
+    on_mesh = _surface_samples(mesh, voxel)
+    near = cKDTree(on_mesh).query(places, distance_upper_bound=_COVERED_VOXELS * voxel)[0] < np.inf
     return round(float(near.mean()), 4)
+
+
+def _surface_samples(mesh: Mesh, voxel: float) -> NDArray[np.float64]:
+    """[S, 3] random points of the mesh, evenly by area: nearly always one within half a voxel."""
+    counts = np.ceil(_SAMPLES_PER_VOXEL * extract.face_areas(mesh) / voxel**2).astype(np.int64)
+    corners = mesh.vertices[np.repeat(mesh.faces, counts, axis=0)].astype(np.float64)
+    weights = np.random.default_rng(0).dirichlet((1.0, 1.0, 1.0), len(corners))
+    return np.asarray(np.einsum("sk,skd->sd", weights, corners))
