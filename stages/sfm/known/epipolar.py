@@ -17,14 +17,12 @@ class PoseCheck:
         pairs: how many matched.
         given: of the poses as they are given.
         rough: the same at four times the distance.
-        mistakes: by likely mistake, of the poses corrected for it.
         refined: of refined poses; None as well if they were not refined.
     """
 
     pairs: int
     given: float | None
     rough: float | None
-    mistakes: dict[str, float | None]
     refined: float | None = None
 
 
@@ -32,7 +30,6 @@ MatchedPair = tuple[int, int, NDArray[np.float64], NDArray[np.float64]]
 
 INLIER_DISTANCE = 0.0025  # of the longer side: 4 px of 1600
 _ROUNDING = 1e-9
-_OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def median_inlier_ratio(
@@ -80,22 +77,6 @@ def epipolar_distances(
     essential = _cross(baseline) @ relative[:3, :3]
     left, right = _pixel_matrix(intrinsics[second]), _pixel_matrix(intrinsics[first])
     return _sampson(left.T @ essential @ right, a, b)
-
-
-def likely_mistakes(poses: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-    """Common mistakes in camera files, each with the poses [V, 4, 4] corrected for it."""
-    inverse = np.asarray(np.linalg.inv(poses), np.float64)
-    return {
-        "y and z of each camera are negated: does the file have OpenGL's axes where OpenCV's are "
-        "expected, or the reverse?": _OPENCV_FROM_OPENGL @ poses,
-        "each pose is inverted: does the file have camera to world instead of world to "
-        "camera?": inverse,
-        "each pose is inverted, and y and z are negated: does the file have OpenGL's camera to "
-        "world?": _OPENCV_FROM_OPENGL @ inverse,
-        "each photograph has the camera after its own: are they in order?": np.roll(poses, -1, 0),
-        "each photograph has the camera before its own: are they in order?": np.roll(poses, 1, 0),
-        "the cameras are in the opposite order: are they in order?": poses[::-1],
-    }
 
 
 def _cross(v: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -15,10 +15,8 @@ from stages.base.stage import Report
 from stages.base.text import counted, listed
 from stages.cameras.camera_file import FilePoints
 from stages.cameras.colmap import NO_OBSERVATIONS, Observations
-from stages.scene import TRANSPARENT, Camera
-from stages.scene.pictures import load_mask
+from stages.scene import Camera
 from stages.sfm.known.pinhole_views import PinholeView
-from stages.sfm.undistorted_images import mask_file
 
 POINTS_PER_PHOTOGRAPH = 20  # with fewer triangulated points, random ones are added
 _VISIBLE_SHARE = 0.1  # of a file's points must be in the pictures of two cameras at least
@@ -29,7 +27,6 @@ def find_points(
     triangulated: Path,
     views: Sequence[PinholeView],
     whole: Sequence[Camera],
-    folder: Path,
     seed: int,
     report: Report,
 ) -> tuple[FilePoints, Observations]:
@@ -40,7 +37,6 @@ def find_points(
         triangulated: points.npz of `triangulation`.
         views: V training views.
         whole: [V] a pinhole camera for the photograph of each view.
-        folder: of the reconstruction, for masks.
         seed: of random points.
         report: receives the metric "points_source" and warnings.
 
@@ -55,9 +51,8 @@ def find_points(
     photographs = {v.number: (camera, v) for v, camera in zip(views, whole, strict=True)}
     if len(cloud.points) < POINTS_PER_PHOTOGRAPH * len(photographs):
         cameras = [camera for camera, _ in photographs.values()]
-        outside = [_empty_space(folder, view) for _, view in photographs.values()]
         names = [view.photo.source for _, view in photographs.values()]
-        cloud = _with_random(cloud, cameras, names, outside, seed, report)
+        cloud = _with_random(cloud, cameras, names, seed, report)
         source = "random"
     report.metric("points_source", source)
     return cloud, observations
@@ -88,26 +83,15 @@ def _triangulated(path: Path) -> tuple[FilePoints, Observations]:
     return FilePoints(data["points"], data["colours"], data["errors_px"], tracks), observed
 
 
-def _empty_space(folder: Path, view: PinholeView) -> NDArray[np.bool_] | None:
-    """[H, W] where a photograph with a transparent background shows nothing; None for others, and
-    for one that is cut into faces."""
-    photo, camera = view.photo, view.camera
-    if photo.outside != TRANSPARENT or photo.face:
-        return None
-    mask = load_mask(folder / mask_file(photo), camera.width, camera.height, photo.outside)
-    return np.asarray(mask == 0)
-
-
 def _with_random(
     cloud: FilePoints,
     cameras: Sequence[Camera],
     names: Sequence[str],
-    outside: Sequence[NDArray[np.bool_] | None],
     seed: int,
     report: Report,
 ) -> FilePoints:
-    """The cloud with random points where most cameras look and none shows empty space."""
-    points, centre, radius = random_points(cameras, seed, outside, names)
+    """The cloud with random points where most cameras look."""
+    points, centre, radius = random_points(cameras, seed, names)
     at = ", ".join(f"{value:.3g}" for value in centre)
     report.warn(
         "cameras-random-start",
@@ -141,7 +125,6 @@ def count_views(cameras: Sequence[Camera], points: NDArray[np.float64]) -> NDArr
 def random_points(
     cameras: Sequence[Camera],
     seed: int,
-    outside: Sequence[NDArray[np.bool_] | None] = (),
     names: Sequence[str] = (),
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """(points [P, 3] in a ball that most cameras see, its centre [3], its radius).
@@ -152,7 +135,6 @@ def random_points(
     Args:
         cameras: pinholes.
         seed: of the random points.
-        outside: for each camera, the pixels [H, W] that show empty space; None for none.
         names: for each camera, its photograph's, for the error.
 
     Raises SplatError "cameras-no-common-view".
@@ -178,9 +160,6 @@ def random_points(
     lengths = radius * np.cbrt(random.uniform(size=(len(directions), 1)))
     points = middle + lengths * directions
     points = points[count_views(cameras, points) >= _SHARE * len(cameras)]
-    for camera, empty in zip(cameras, outside, strict=False):
-        if empty is not None:
-            points = points[~_in_empty_space(camera, empty, points)]
     points = points[:RANDOM_POINTS]
     if len(points) < RANDOM_POINTS // 20:
         sees = np.array([count_views([camera], middle[None])[0] > 0 for camera in cameras])
@@ -188,18 +167,6 @@ def random_points(
         sides = f"{sides}, and {_some(names, ~sees)} do not"
         raise _no_common_view(f"Few of them see the same part of space: {sides}")
     return points, middle, radius
-
-
-def _in_empty_space(
-    camera: Camera, empty: NDArray[np.bool_], points: NDArray[np.float64]
-) -> NDArray[np.bool_]:
-    """[P] whether a point projects to a pixel of `empty`."""
-    pixels, z = camera.project(points)
-    shown = camera.shows(pixels) & (z > 0)
-    columns, rows = np.floor(pixels[shown]).astype(np.int64).T
-    found = np.zeros(len(points), np.bool_)
-    found[shown] = empty[rows, columns]
-    return found
 
 
 def _some(names: Sequence[str], chosen: NDArray[np.bool_]) -> str:

@@ -87,18 +87,18 @@ def reconstruct(
     views = write_pinhole_views(posed, capture.folder, folder, report)
     roles = [posed[view.number].role for view in views]
     training = [i for i, role in enumerate(roles) if role != "test"]
-    project = _project([views[i] for i in training], folder, work, settings.seed)
-    known = _known_cameras([views[i] for i in training])
-    out = _match(project, known, settings, work, deadline, report)
+    chosen = [views[i] for i in training]
+    project = _project(chosen, folder, work, settings.seed)
+    known = _known_cameras(chosen)
+    turns = np.array([view.rotation for view in chosen])
+    pairs = neighbours(known.world_to_camera, turns, project.photographs.frames)
+    out = _match(project, known, tuple(pairs), settings, work, deadline, report)
     check = json.loads((out / "pose_check.json").read_text(encoding="utf-8"))
     _check_poses(PoseCheck(**check), settings, report)
     if settings.refine_cameras:
-        views = _refined(views, out / POINTS, report)
-    chosen = [views[i] for i in training]
+        views = chosen = _refined(views, out / POINTS, report)  # none is for testing
     whole = _whole(chosen, posed)
-    cloud, observed = find_points(
-        from_file, out / POINTS, chosen, whole, folder, settings.seed, report
-    )
+    cloud, observed = find_points(from_file, out / POINTS, chosen, whole, settings.seed, report)
     observed = replace(observed, views=np.array(training, np.int32)[observed.views])
     scale = KnownScale(
         settings.scale, settings.marker, settings.crs, settings.metres, found.georeference
@@ -150,7 +150,6 @@ def _known_cameras(views: Sequence[PinholeView]) -> KnownCameras:
     return KnownCameras(
         intrinsics=np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras]),
         world_to_camera=np.array([camera.world_to_camera for camera in cameras]),
-        rotations=np.array([view.rotation for view in views]),
     )
 
 
@@ -202,6 +201,7 @@ def neighbours(
 def _match(
     project: Project,
     known: KnownCameras,
+    pairs: tuple[Pair, ...],
     settings: SfmSettings,
     work: Path,
     deadline: float,
@@ -210,8 +210,6 @@ def _match(
     """Features, matches, and the check of poses and points from matches; skips finished steps.
     Returns the folder that the last step writes. deadline: of `time.monotonic`."""
     sift, refine, out = Sift(settings.max_features), settings.refine_cameras, work / "known"
-    frames = project.photographs.frames
-    pairs = tuple(neighbours(known.world_to_camera, known.rotations, frames))
     prepare_work_folder(work, project, sift, known, pairs, refine)
     for job in (
         Features(project, sift),
@@ -243,7 +241,7 @@ def _refined(views: Sequence[PinholeView], path: Path, report: Report) -> list[P
 
 
 def _check_poses(check: PoseCheck, settings: SfmSettings, report: Report) -> None:
-    """Refuse poses that do not fit the matches, and name the likely cause."""
+    """Refuse poses that do not fit the matches."""
     ratio = check.given
     if settings.refine_cameras:
         report.metric("epipolar_inlier_ratio_before", None if ratio is None else round(ratio, 4))
@@ -258,9 +256,7 @@ def _check_poses(check: PoseCheck, settings: SfmSettings, report: Report) -> Non
         return
     if ratio >= INLIER_RATIO:
         return
-    mistake, best = max(check.mistakes.items(), key=lambda other: other[1] or 0.0)
-    explained = (best or 0.0) >= INLIER_RATIO
-    if not explained and (check.rough or 0.0) >= ROUGH_INLIER_RATIO:
+    if (check.rough or 0.0) >= ROUGH_INLIER_RATIO:
         report.warn(
             "cameras-rough",
             f"Only {ratio:.0%} of the matches lie within 4 px of 1600 of where the cameras predict "
@@ -268,21 +264,17 @@ def _check_poses(check: PoseCheck, settings: SfmSettings, report: Report) -> Non
             "blurred. --refine-cameras refines their poses.",
         )
         return
-    likely = (
-        f"The matches fit ({best:.0%}) if {mistake}"
-        if explained
-        else "Check that the file belongs to these photographs, under these names, uncropped."
-    )
     error = ReconstructionError(
         "cameras-do-not-fit",
         given=f"Only {ratio:.0%} of the matches between two photographs fit the file's cameras.",
         wanted=f"At least {INLIER_RATIO:.0%}, as cameras of these photographs have.",
-        hint=f"{likely} --allow-partial goes on all the same; with --cameras '' splat finds "
-        "cameras itself.",
+        hint="Check that the file belongs to these photographs, under these names, uncropped, and "
+        "follows the axes of its format: camera to world in OpenGL's for a transforms.json. "
+        "--allow-partial goes on all the same; with --cameras '' splat finds cameras itself.",
     )
     if not settings.allow_partial:
         raise error
-    report.warn(error.code, f"Accepted because of --allow-partial: {error.given} {likely}")
+    report.warn(error.code, f"Accepted because of --allow-partial: {error.given}")
 
 
 def _finish(

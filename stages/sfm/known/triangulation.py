@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from stages.cameras.camera_file import poses_of
 from stages.scene.rotations import similarity
-from stages.sfm.known.epipolar import PoseCheck, likely_mistakes, median_inlier_ratio
+from stages.sfm.known.epipolar import PoseCheck, median_inlier_ratio
 from stages.sfm.worker.job import CameraGuess, KnownCameras, Neighbours, Project, Triangulation
 from stages.sfm.worker.mapping import point_arrays
 from stages.sfm.worker.matching import match_pairs
@@ -45,39 +45,17 @@ def triangulate(job: Triangulation) -> None:
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
     pairs = _matched_points(job.project.database)
-    mistakes = _corrected(poses, job.cameras.rotations, photographs.frames)
     side = float(max(max(camera.width, camera.height) for camera in photographs.cameras))
     check = PoseCheck(
         pairs=len(pairs),
         given=median_inlier_ratio(pairs, lens, poses, side),
         rough=median_inlier_ratio(pairs, lens, poses, 4.0 * side),
-        mistakes={
-            name: median_inlier_ratio(pairs, lens, corrected, side)
-            for name, corrected in mistakes.items()
-        },
     )
     if job.refine:
         poses = _refined(job, out / "colmap")
         check = replace(check, refined=median_inlier_ratio(pairs, lens, poses, side))
     (out / "pose_check.json").write_text(json.dumps(vars(check)), encoding="utf-8")
     _save_points(_triangulated(job, poses, out / "colmap"), poses, out / "points.npz")
-
-
-def _corrected(
-    poses: NDArray[np.float64], faces: NDArray[np.float64], photographs: NDArray[np.int64]
-) -> dict[str, NDArray[np.float64]]:
-    """`likely_mistakes` of the photographs' poses, as poses of the views.
-
-    Args:
-        poses: [V, 4, 4] of the views.
-        faces: [V, 3, 3] from the photographs' axes to those of the views.
-        photographs: [V] number of each view's photograph.
-    """
-    turns = np.tile(np.eye(4), (len(faces), 1, 1))
-    turns[:, :3, :3] = faces
-    first = np.unique(photographs, return_index=True)[1]
-    whole = turns[first].transpose(0, 2, 1) @ poses[first]
-    return {name: turns @ fixed[photographs] for name, fixed in likely_mistakes(whole).items()}
 
 
 def _cameras(

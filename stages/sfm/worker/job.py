@@ -99,12 +99,10 @@ class KnownCameras:
     Args:
         intrinsics: [P, 4] fx, fy, cx, cy.
         world_to_camera: [P, 4, 4].
-        rotations: [P, 3, 3] from the axes of the frame to the camera's.
     """
 
     intrinsics: NDArray[np.float64]
     world_to_camera: NDArray[np.float64]
-    rotations: NDArray[np.float64]
 
 
 @dataclass(frozen=True)

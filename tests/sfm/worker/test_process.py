@@ -51,7 +51,7 @@ def test_a_job_survives_being_written(tmp_path: Path) -> None:
 def test_known_cameras_survive_being_written_exactly(tmp_path: Path) -> None:
     project, file = job(tmp_path).project, tmp_path / "job.json"
     random = np.random.default_rng(0)
-    cameras = KnownCameras(random.random((1, 4)), random.random((1, 4, 4)), np.eye(3)[None])
+    cameras = KnownCameras(random.random((1, 4)), random.random((1, 4, 4)))
     triangulation = Triangulation(project, tmp_path / "out", cameras, refine=True)
     read = Job.read(triangulation.write(file))
     assert isinstance(read, Triangulation)
