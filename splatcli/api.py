@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from stages.base.settings import changed
 from stages.formats.output_formats import DEFAULT_FORMATS
-from stages.raster.backends import backend_of_settings
 from stages.raster.draw import render
 from stages.run.listener import Listener
 from stages.run.pipeline import Pipeline
@@ -82,5 +81,5 @@ def process(
         splats=pipeline.load("quantise").splats,
         assets=pipeline.load("export"),
         metrics={manifest.stage: manifest.metrics for manifest in manifests},
-        backend=backend_of_settings(settings["train"]),
+        backend=settings["train"].backend,
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from inspect import Parameter
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -13,7 +13,6 @@ from stages.base.distribution import install_command
 from stages.base.settings import Setting
 from stages.formats import FORMATS
 from stages.raster.backends import CHOICES
-from stages.raster.torch_device import DEVICES
 
 _INSTALL_RAY = install_command("cluster").replace("[", r"\[")  # in rich markup
 
@@ -52,19 +51,19 @@ Cluster = Annotated[
 ]
 
 
-def _chosen(name: str, choices: tuple[str, ...], help: str) -> Any:
-    """An option that is one of `choices`."""
-    text = help.format(", ".join(choices))
-    setting = Setting(name, f"--{name}", str, choices=choices, help=text, panel="Advanced")
-    return option(setting, shown=False)
-
-
 Backend = Annotated[
     str | None,
-    _chosen("backend", CHOICES, "Rendering backend: {}; by default the one of the training."),
-]
-Device = Annotated[
-    str | None, _chosen("device", DEVICES, "Torch device for --backend reference: {}.")
+    option(
+        Setting(
+            "backend",
+            "--backend",
+            str,
+            choices=CHOICES,
+            help=f"Rendering backend: {', '.join(CHOICES)}; by default the one of the training.",
+            panel="Advanced",
+        ),
+        shown=False,
+    ),
 ]
 
 

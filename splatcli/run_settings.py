@@ -10,7 +10,7 @@ import typer
 
 from splatcli import console, options
 from stages.base.settings import Setting, changed, settings_of
-from stages.raster.backends import backend_of, backend_of_settings
+from stages.raster.backends import backend_of
 from stages.run.pipeline import Pipeline
 from stages.run.runfolder import is_run_folder
 from stages.run.stages import STAGE_NAMES, STAGE_OF, options_of
@@ -117,9 +117,9 @@ def combined(
         name: changed(settings, given if len(chosen) == 1 else options_of(name, given))
         for name, settings in chosen.items()
     }
-    if given.keys() & {"backend", "device"}:  # an error now, not after an hour of other work
+    if "backend" in given:  # an error now, not after an hour of other work
         with_backend = [settings for settings in found.values() if hasattr(settings, "backend")]
-        for name in {backend_of_settings(settings) for settings in with_backend}:
+        for name in {settings.backend for settings in with_backend}:
             backend_of(name).require()
     return found
 

@@ -170,11 +170,9 @@ def cameras() -> str:
 def backends() -> str:
     from stages.raster.backends import BACKENDS
 
-    rows: list[tuple[str, ...]] = [("`auto`", "the fastest that runs here", "")]
-    for backend in BACKENDS:
-        devices = ", ".join(f"`{device}`" for device in backend.devices)
-        rows.append((f"`{backend.name}`", backend.summary, devices))
-    return _table(("`--backend`", "is", "`--device`"), rows)
+    rows: list[tuple[str, ...]] = [("`auto`", "the fastest that runs here")]
+    rows += [(f"`{backend.name}`", backend.summary) for backend in BACKENDS]
+    return _table(("`--backend`", "is"), rows)
 
 
 def presets() -> str:

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from splatcli import console
-from splatcli.arguments import Backend, Device, RunOrFile
+from splatcli.arguments import Backend, RunOrFile
 from splatcli.folders import load_target
 from splatcli.options import given_only
 from splatcli.progress import counting
@@ -20,10 +20,8 @@ from splatcli.render_options import RenderOptions
 from stages.base import memory
 from stages.base.errors import ResourceError
 from stages.base.settings import changed
-from stages.raster.backends import AUTO, qualified_name
 from stages.raster.definition import Rendering
 from stages.raster.draw import renderer, supersampled
-from stages.raster.torch_device import CPU
 from stages.run import results
 from stages.scene import Camera, Splats, View
 from stages.viewer import sinks
@@ -42,7 +40,6 @@ def render(
         typer.Option("--out", "-o", help="Picture (.png), film (.mp4) or folder of frames."),
     ] = Path("view.png"),
     backend: Backend = None,
-    device: Device = None,
     **given: Any,
 ) -> None:
     """Draw the splats: from a photograph's camera, or as a film along a path.
@@ -58,8 +55,7 @@ def render(
     cameras = _cameras(splats, results.views_of(run), wanted, kind)
     _check_memory(max(cameras, key=lambda camera: camera.width * camera.height))
     console.note_compiling()
-    name = qualified_name(backend or AUTO, device or CPU) if backend or device else None
-    draw = renderer(splats, backend=name or results.backend_of_run(run))
+    draw = renderer(splats, backend=backend or results.backend_of_run(run))
     draw = supersampled(draw, splats.draw_settings.side)
     rate = _draw_all(draw, cameras, _sink(out, wanted, kind, cameras))
     facts: dict[str, Any] = {

@@ -27,7 +27,6 @@ from stages.distributed import block_folders, merge, partition
 from stages.distributed.partition import Cell
 from stages.distributed.tasks import Executor, OpenExecutor, RunTask, resources_of, run_all
 from stages.evaluate.evaluation import image_renderer, load_evaluation_views
-from stages.raster.backends import backend_of_settings
 from stages.run.listener import Listener
 from stages.run.pipeline import Pipeline
 from stages.scene import (
@@ -112,7 +111,7 @@ class _BlockTraining:
         points, weights = partition.weighted_points(replace(self.whole, views=training))
         cells = partition.partition(points, weights, blocks)
         cameras = [view.camera for view in self.whole.views]
-        backend = backend_of_settings(self.settings)
+        backend = self.settings.backend
         fractions = partition.block_fractions(coarse, cells, cameras, backend)
         assigned = partition.assign_views(fractions)
         folders = self._blocks(seeds, coarse, cells, assigned, partition.margin(points))
@@ -135,7 +134,7 @@ class _BlockTraining:
     def _evaluate(self, splats: Splats, held: Sequence[View], folder: Path) -> None:
         settings = splats.draw_settings
         views = load_evaluation_views(self.whole.folder, held, settings)
-        render = image_renderer(splats, backend_of_settings(self.settings))
+        render = image_renderer(splats, self.settings.backend)
         write_quality(render, views, settings, self.whole, folder, self.report)
         write_history(History(), folder, self.report)
 
@@ -220,9 +219,7 @@ class _BlockTraining:
             return own
         training = [view for view in views if view.role != "test"]
         photographs = load_evaluation_views(self.whole.folder, training, splats.draw_settings)
-        return merge.most_visible(
-            splats, own, most, photographs, backend_of_settings(self.settings)
-        )
+        return merge.most_visible(splats, own, most, photographs, self.settings.backend)
 
     def _begin(
         self, name: str, part: Reconstruction, seeds: Splats, coarse: Splats, wide: Cell
@@ -265,7 +262,7 @@ class _BlockTraining:
     ) -> TrainedSplats:
         """The blocks as one model, block after block, whose seams are fine-tuned on `seam_views`.
         training_views: how many the whole scene has."""
-        degree, backend = self.settings.sh_degree, backend_of_settings(self.settings)
+        degree, backend = self.settings.sh_degree, self.settings.backend
         splats, counts = merge.merge_blocks(
             [part.with_sh_degree(degree) for part in parts], cells, draw_settings
         )

@@ -106,7 +106,7 @@ class Resources:
 def resources_of(train: Any) -> Resources:
     """The largest resources that a run with these training settings needs."""
     memory_mib = needed_mib(train.max_splats) if train.max_splats else None
-    return Resources(memory_mib, gpus=int(train.backend == "gpu" or train.device == "cuda"))
+    return Resources(memory_mib, gpus=int(train.backend == "gpu"))
 
 
 class Executor(Protocol):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from stages.base.settings import setting
 from stages.base.stage import Stage, in_module
 from stages.formats.output_formats import DEFAULT_FORMATS, drawing_setting, formats_setting
-from stages.raster.backends import backend_setting, device_setting
+from stages.raster.backends import backend_setting
 
 # Every system must take the name, USD's packages too: brackets separate names inside them.
 _NAME = r"(?!assets$)(?![ .])[^/\\:*?\"<>|\[\]\x00-\x1f]{1,100}(?<![ .])"
@@ -30,7 +30,6 @@ class ExportSettings:
         "folder, no suffix.",
     )
     backend: str = backend_setting()
-    device: str = device_setting()
     drawing: str = drawing_setting()
     mesh_triangles: int = setting(
         50_000, "Triangles of the mesh, at most about.", min=100, max=100_000_000

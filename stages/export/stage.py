@@ -31,7 +31,6 @@ from stages.formats.values import drop_undrawable
 from stages.mesh.collision_mesh import make_collision_mesh
 from stages.proof.prover import Prover, cameras_for, provers_of
 from stages.raster.backends import (
-    backend_of_settings,
     report_backend,
 )
 from stages.scene import ExportedAssets, ExportedFile, QuantisedSplats, Reconstruction, Splats
@@ -57,7 +56,7 @@ def run(
     _warn_of_missing(len(splats), dropped, report)
     chosen = tuple(name for name in dict.fromkeys(settings.formats) if name in FORMATS)
     cameras = cameras_for(splats, reconstruction.views)
-    prover_of = provers_of(quantised, cameras, backend_of_settings(settings))
+    prover_of = provers_of(quantised, cameras, settings.backend)
     files, figures = [], {}
     for number, name in enumerate(chosen):
         if report.stop_requested.is_set():
@@ -79,7 +78,7 @@ def run(
     for file in _write_meshes(splats, reconstruction, settings, folder, report):
         files.append(file)
         figures[file.format] = {"size_bytes": file.size_bytes}
-    report_backend(report, backend_of_settings(settings))
+    report_backend(report, settings.backend)
     report.metric("files", len(files))
     report.metric("splats", len(splats))
     report.metric("dropped", dropped)
@@ -102,7 +101,7 @@ def _write_meshes(
         return []
 
     made = make_collision_mesh(
-        splats, reconstruction, settings.mesh_triangles, backend_of_settings(settings), report
+        splats, reconstruction, settings.mesh_triangles, settings.backend, report
     )
     report.metric("mesh", made.figures)
     files = []

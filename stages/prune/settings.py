@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from stages.base.settings import setting
 from stages.base.stage import Stage, in_module
 from stages.formats.format_table import FORMATS
-from stages.raster.backends import backend_setting, device_setting
+from stages.raster.backends import backend_setting
 
 SOG_LOSS_DB = 0.3  # PSNR of training views that the bit depths of a .sog file may cost
 DECIDING_VIEWS = 12  # training views, at most, on which bit depths are measured
@@ -65,7 +65,6 @@ class PruneSettings:
         0.0, "Time limit in seconds: no round begins after it. 0: no limit.", min=0, max=1e7
     )
     backend: str = backend_setting()
-    device: str = device_setting()
 
 
 STAGE = Stage(

@@ -29,7 +29,6 @@ from stages.prune.settings import DECIDING_VIEWS, SOG_LOSS_DB, PruneSettings
 from stages.prune.summary import advise_more_splats, describe_loss, summarise
 from stages.prune.targets import Targets
 from stages.raster.backends import (
-    backend_of_settings,
     report_backend,
 )
 from stages.scene import (
@@ -53,7 +52,7 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     deadline = time.monotonic() + (settings.seconds or math.inf)
     trained: TrainedSplats = inputs["train"]
     reconstruction: Reconstruction = inputs["sfm"].with_cameras(trained.cameras)
-    splats, backend = trained.splats, backend_of_settings(settings)
+    splats, backend = trained.splats, settings.backend
     training, held_out = (
         load_evaluation_views(
             reconstruction.folder, views, splats.draw_settings, report.stop_requested
@@ -130,7 +129,7 @@ def _size_measure(
     row = FORMATS[settings.mb_of]
     depths: dict[str, int] = {}
     if settings.max_mb and row.has_bit_depths:
-        views, backend = evenly_spaced(training, DECIDING_VIEWS), backend_of_settings(settings)
+        views, backend = evenly_spaced(training, DECIDING_VIEWS), settings.backend
         depths, _ = choose_bits(splats, lambda s: mean_psnr_db(s, views, backend), SOG_LOSS_DB)
     return lambda s: file_size_bytes(row, s, depths, reconstruction.units, reconstruction.views)
 

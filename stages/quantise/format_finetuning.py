@@ -18,7 +18,6 @@ from stages.formats.sog_quantisation import BitDepths, quantise_splats, splats_t
 from stages.formats.values import drop_undrawable
 from stages.quantise.rounding import finetune_to_rounding, write_and_read
 from stages.quantise.settings import QuantiseSettings
-from stages.raster.backends import backend_of_settings
 from stages.raster.compensation import without_compensation
 from stages.scene import (
     QuantisedSplats,
@@ -71,7 +70,7 @@ class FormatFinetuning:
             deciding_views: as in the class.
             report: says before each step whether to stop.
         """
-        splats, backend = drop_undrawable(splats)[0], backend_of_settings(settings)
+        splats, backend = drop_undrawable(splats)[0], settings.backend
         training = split_held_out(reconstruction.views)[0]
         views = load_evaluation_views(
             reconstruction.folder, training, splats.draw_settings, report.stop_requested
@@ -121,7 +120,7 @@ class FormatFinetuning:
         if row.has_bit_depths and quantised.sog_bits is not None:
             found = smallest_rotations(found)
             rounded = partial(quantise_splats, bits=BitDepths(**quantised.sog_bits))
-        steps, backend = self.settings.rounding_steps, backend_of_settings(self.settings)
+        steps, backend = self.settings.rounding_steps, self.settings.backend
         found = finetune_to_rounding(rounded, found, self.rounding, steps, self.view_counts)
         plain_db, finetuned_db = (
             mean_psnr_db(written(splats), self.deciding_views, backend) for splats in (plain, found)

@@ -15,7 +15,7 @@ from stages.formats.output_formats import (
     formats_to_finetune,
 )
 from stages.prune.settings import DECIDING_VIEWS, SOG_LOSS_DB
-from stages.raster.backends import backend_setting, device_setting
+from stages.raster.backends import backend_setting
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,6 @@ class QuantiseSettings:
         max=100_000,
     )
     backend: str = backend_setting()
-    device: str = device_setting()
 
     def __post_init__(self) -> None:
         unknown = tuple(name for name in self.formats if name not in CHOICES)  # refused by checks

@@ -40,7 +40,6 @@ from stages.quantise.format_finetuning import FormatFinetuning
 from stages.quantise.rounding import write_and_read
 from stages.quantise.settings import QuantiseSettings
 from stages.raster.backends import (
-    backend_of_settings,
     report_backend,
 )
 from stages.scene import (
@@ -104,7 +103,7 @@ def run(
     report.metric("raw_mib", round(_bytes(splats) / 2**20, 3))
     report.metric("kept_mib", round(_bytes(kept) / 2**20, 3))
     report.metric("evaluated_side_px", splats.draw_settings.side)
-    report_backend(report, backend_of_settings(settings))
+    report_backend(report, settings.backend)
     quantised = replace(quantised, sog_bits=bits)
     quantised = replace(quantised, finetuned=finetuning.to_rounding(quantised))
     _save(folder, quantised, decisions)
@@ -161,7 +160,7 @@ def _flat_colours(
         return None
     views = split_held_out(reconstruction.views)[0]
     cameras = (splats.draw_settings.camera(view.camera) for view in views)
-    return view_averaged_dc(splats, cameras, backend_of_settings(settings))
+    return view_averaged_dc(splats, cameras, settings.backend)
 
 
 def _bytes(splats: Splats) -> int:
@@ -188,7 +187,7 @@ def _measures(
         )
     deciding = tuple(evenly_spaced(training, settings.max_views))
     evaluated, what = (held_out, "held out") if held_out else (deciding, "training")
-    folder, backend = reconstruction.folder, backend_of_settings(settings)
+    folder, backend = reconstruction.folder, settings.backend
     decider, evaluator = (
         load_evaluation_views(folder, views, draw_settings, report.stop_requested)
         for views in (deciding, evaluated)

@@ -3,27 +3,23 @@
 To add a backend: write a class with the methods of `definition.Rasteriser` and add one row to
 `BACKENDS`. A backend that also has training kernels gets a row in `train.steps.step`; the others
 train through `forward` and `backward`. Modules named in the list are imported at first use.
-
-A backend may run on several torch devices. Its full name then has the device after an "@":
-"reference@cuda".
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
-from stages.base.errors import SplatError, UsageError
+from stages.base.errors import SplatError
 from stages.base.settings import setting
-from stages.raster.torch_device import CPU, DEVICES
 
 if TYPE_CHECKING:
     from stages.base.stage import Report
     from stages.raster.definition import Rasteriser
 
 AUTO = "auto"
-_DEVICE_MARK = "@"
+CPU = "cpu"  # what a manifest calls the hardware of a backend without a description
 
 
 @dataclass(frozen=True)
@@ -38,10 +34,7 @@ class Backend:
         summary: a few words for the help text.
         availability: function that returns why "auto" must skip the backend on this machine, or ""
             if it can be used. Empty for a backend that always runs.
-        description: function that describes the hardware; empty for the CPU. Takes the device if
-            `devices` is not empty, as `rasteriser` does.
-        devices: torch devices that the backend can run on, if it runs on more than one.
-        device: the one of `devices` that was requested.
+        description: function that describes the hardware; empty for the CPU.
     """
 
     name: str
@@ -49,30 +42,25 @@ class Backend:
     summary: str
     availability: str = ""
     description: str = ""
-    devices: tuple[str, ...] = ()
-    device: str = CPU
 
     def describe(self) -> str:
         """The hardware that it runs on, for a manifest. Raises SplatError where it is absent."""
-        return str(resolve_name(self.description)(*self._device())) if self.description else CPU
+        return str(resolve_name(self.description)()) if self.description else CPU
 
     def create(self) -> Rasteriser:
         """A new rasteriser. Raises SplatError if the hardware that it needs is absent."""
-        rasteriser: Rasteriser = resolve_name(self.rasteriser)(*self._device())
+        rasteriser: Rasteriser = resolve_name(self.rasteriser)()
         return rasteriser
 
     def require(self) -> None:
         """Raises SplatError if the hardware that it needs is absent. Imports no more than that
         check needs."""
-        if self.availability or self.device != CPU:
+        if self.availability:
             self.create()
 
     def why_unavailable(self) -> str:
         """Why "auto" does not choose it on this machine; "" if it may."""
         return str(resolve_name(self.availability)()) if self.availability else ""
-
-    def _device(self) -> tuple[str, ...]:
-        return (self.device,) if self.devices else ()
 
 
 # "auto" takes the first that is available.
@@ -89,8 +77,6 @@ BACKENDS = (
         "reference",
         "stages.raster.reference_rasteriser:ReferenceRasteriser",
         "torch, slow",
-        description="stages.raster.torch_device:describe",
-        devices=DEVICES,
     ),
 )
 CHOICES = (AUTO, *(backend.name for backend in BACKENDS))
@@ -99,12 +85,9 @@ CHOICES = (AUTO, *(backend.name for backend in BACKENDS))
 def backend_of(name: str) -> Backend:
     """The backend of that name, or the one that "auto" takes. Raises ValueError for an unknown
     name."""
-    base_name, _, device = name.partition(_DEVICE_MARK)
     for backend in BACKENDS:
-        if backend.name == base_name or (base_name == AUTO and not backend.why_unavailable()):
-            if device and device not in backend.devices:
-                break
-            return replace(backend, device=device or CPU)
+        if backend.name == name or (name == AUTO and not backend.why_unavailable()):
+            return backend
     raise ValueError(f"backend {name!r}, wanted one of {', '.join(CHOICES)}")
 
 
@@ -131,29 +114,6 @@ def runs_here(name: str) -> bool:
     return True
 
 
-def qualified_name(backend: str, device: str = CPU) -> str:
-    """The backend's full name from the options --backend and --device. Raises SplatError
-    (option-device) for a backend that cannot run on that device."""
-    if device == CPU:
-        return backend
-    able = [each.name for each in BACKENDS if device in each.devices]
-    if backend in able:
-        return f"{backend}{_DEVICE_MARK}{device}"
-    raise UsageError(
-        "option-device",
-        given=f"--device {device} with --backend {backend}, which chooses its own device.",
-        wanted=f"--device goes with --backend {' or '.join(able)}.",
-        hint=f"Add --backend {able[0]}, or leave --device out (--device {CPU} if the run folder "
-        "remembers another).",
-    )
-
-
-def backend_of_settings(settings: Any) -> str:
-    """Full name of the backend that a stage's settings choose. Raises
-    SplatError (option-device)."""
-    return qualified_name(settings.backend, settings.device)
-
-
 def report_backend(report: Report, name: str) -> None:
     """Record in a stage's report which backend `name` stands for here, and its hardware."""
     chosen = backend_of(name)
@@ -166,9 +126,3 @@ def backend_setting() -> Any:
     choices = ", ".join(f"{backend.name} ({backend.summary})" for backend in BACKENDS)
     help = f"Rendering backend: {AUTO} (the fastest available), {choices}."
     return setting(AUTO, help, choices=CHOICES, midway=True, panel="Advanced")
-
-
-def device_setting() -> Any:
-    """The field `device` of a stage's settings."""
-    help = f"Torch device for --backend reference: {', '.join(DEVICES)}."
-    return setting(CPU, help, choices=DEVICES, midway=True, panel="Advanced")

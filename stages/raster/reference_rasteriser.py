@@ -25,7 +25,6 @@ from stages.raster.definition import (
     gradient_columns,
     with_smoothing,
 )
-from stages.raster.gpu.device import gpu_errors_explained
 from stages.raster.reference import (
     Parameters,
     Projected,
@@ -38,7 +37,6 @@ from stages.raster.reference import (
     render_projected,
     weights_of,
 )
-from stages.raster.torch_device import CPU, device_named, widest
 from stages.scene import Camera
 
 _LARGEST = float(np.finfo(np.float32).max)
@@ -57,19 +55,14 @@ class ReferenceForward:
 
 
 class ReferenceRasteriser:
-    """Draws and differentiates in torch on any of its devices, in float64 where the device has it.
-    Nothing is kept between passes: the backward pass draws again, block by block."""
-
-    def __init__(self, on: str = CPU) -> None:
-        """on: one of `torch_device.DEVICES`. Raises SplatError if it is not available."""
-        self.device = device_named(on)
-        self.dtype = widest(self.device)
+    """Draws and differentiates in torch, in float64. Nothing is kept between passes: the backward
+    pass draws again, block by block."""
 
     def forward(
         self, arrays: Arrays, camera: Camera, settings: RasterSettings, depths: bool = False
     ) -> ReferenceForward:
         """See `definition.Rasteriser`."""
-        with gpu_errors_explained(len(arrays[0])), torch.no_grad():
+        with torch.no_grad():
             p, widths = self._parameters(arrays)
             projected = project(p, camera, settings, widths)
             image, *planes = render_projected(p, projected, camera, settings)
@@ -83,15 +76,14 @@ class ReferenceRasteriser:
     def backward(self, forward: ReferenceForward, v_image: NDArray[np.float32]) -> Backward:
         """See `definition.Rasteriser`."""
         rows, degree, arrays = forward.visible, forward.settings.sh_degree, forward.arrays
-        with gpu_errors_explained(len(arrays[0])):
-            p, widths = self._parameters(arrays)
-            for tensor in p.tensors():
-                tensor.requires_grad_()
-            projected = project(p, forward.camera, forward.settings, widths)
-            rgb = colours(p.rows(projected.index), self._tensor(forward.camera.centre), degree)
-            shown, shades = _leaves(projected), rgb.detach().requires_grad_()
-            self._blend_back(shown, shades, forward, self._tensor(v_image))
-            _continue_backward((rgb, *vars(projected).values()), (shades, *vars(shown).values()))
+        p, widths = self._parameters(arrays)
+        for tensor in p.tensors():
+            tensor.requires_grad_()
+        projected = project(p, forward.camera, forward.settings, widths)
+        rgb = colours(p.rows(projected.index), self._tensor(forward.camera.centre), degree)
+        shown, shades = _leaves(projected), rgb.detach().requires_grad_()
+        self._blend_back(shown, shades, forward, self._tensor(v_image))
+        _continue_backward((rgb, *vars(projected).values()), (shades, *vars(shown).values()))
         place = np.empty(len(arrays[0]), np.int64)
         place[_host(projected.index)] = np.arange(len(projected.index))
         coefficients = (min(degree, int(arrays[4].shape[1] ** 0.5) - 1) + 1) ** 2
@@ -123,9 +115,8 @@ class ReferenceRasteriser:
         changes by -w c + b alpha / (1 - alpha), with b what is composited behind it."""
         camera, settings = forward.camera, forward.settings
         (p, widths), planes = self._parameters(forward.arrays), self._tensor(residual)
-        like: dict[str, Any] = {"dtype": self.dtype, "device": self.device}
-        found = torch.zeros(len(forward.arrays[0]), CONTRIBUTIONS, **like)
-        with gpu_errors_explained(len(found)), torch.no_grad():
+        found = torch.zeros(len(forward.arrays[0]), CONTRIBUTIONS, dtype=torch.float64)
+        with torch.no_grad():
             projected = project(p, camera, settings, widths)
             rgb = colours(p.rows(projected.index), self._tensor(camera.centre), settings.sh_degree)
             for place, rows, pixels in picture_blocks(projected, camera):
@@ -159,7 +150,7 @@ class ReferenceRasteriser:
         return Parameters(*parameters), widths if len(widths) else None
 
     def _tensor(self, values: Any) -> Tensor:
-        return torch.tensor(values, dtype=self.dtype, device=self.device)
+        return torch.tensor(values, dtype=torch.float64)
 
 
 def _touching(projected: Projected, camera: Camera) -> Tensor:

@@ -8,7 +8,7 @@ from typing import Any
 
 from stages.base.errors import UsageError
 from stages.formats import read
-from stages.raster.backends import AUTO, backend_of_settings, runs_here
+from stages.raster.backends import AUTO, runs_here
 from stages.run import runfolder
 from stages.run.pipeline import Pipeline
 from stages.scene import Reconstruction, Splats, View, draw_settings_of
@@ -143,5 +143,5 @@ def backend_of_run(pipeline: Pipeline | None) -> str:
     that cannot use that backend."""
     if pipeline is None:
         return AUTO
-    requested = backend_of_settings(pipeline.recorded_settings()["train"])
+    requested: str = pipeline.recorded_settings()["train"].backend
     return requested if runs_here(requested) else AUTO

@@ -25,7 +25,6 @@ SHARED_OPTIONS = {
     "formats": ("quantise", "export"),  # what is fine-tuned to, and what is written
     "drawing": ("train", "quantise", "export"),  # trained for, fine-tuned for, and written for it
     "backend": ("train", "prune", "quantise", "export"),
-    "device": ("train", "prune", "quantise", "export"),
 }
 
 

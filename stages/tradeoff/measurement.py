@@ -25,8 +25,7 @@ from stages.evaluate.evaluation import (
 from stages.evaluate.floaters import near_camera_floaters
 from stages.formats.sog_quantisation import splats_to_write
 from stages.formats.values import drop_undrawable
-from stages.raster.backends import backend_of
-from stages.raster.torch_device import CPU
+from stages.raster.backends import CPU, backend_of
 from stages.scene import (
     DrawSettings,
     QuantisedSplats,

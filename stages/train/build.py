@@ -8,7 +8,7 @@ from pathlib import Path
 from stages.base.stage import Report
 from stages.base.text import counted
 from stages.evaluate.evaluation import load_evaluation_views
-from stages.raster.backends import backend_of, backend_of_settings
+from stages.raster.backends import backend_of
 from stages.scene import Reconstruction, draw_settings_of, split_held_out, training_extent
 from stages.scene.light import LEAST_EXPLAINED, NOISE_EV, spread_ev
 from stages.train.camera_refinement import CameraRefinement
@@ -41,7 +41,7 @@ def make_trainer(
     determined = splats_determined([view.levels[-1].camera for view in train], settings.sh_degree)
     cap = cap_for(folder, settings.max_splats, determined)
     report.metric("splat_cap_free_mib", cap.free_mib)
-    extent, backend = training_extent(reconstruction), backend_of_settings(settings)
+    extent, backend = training_extent(reconstruction), settings.backend
     refinement = None
     if settings.refine_in_training:
         cameras = {view.name: view.levels[-1].camera for view in train}

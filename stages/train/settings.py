@@ -8,7 +8,7 @@ from stages.base.settings import setting
 from stages.base.stage import Stage, in_module
 from stages.formats.format_table import PLAIN
 from stages.formats.output_formats import drawing_setting
-from stages.raster.backends import backend_setting, device_setting
+from stages.raster.backends import backend_setting
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,6 @@ class TrainSettings:
         max=1e30,
     )
     backend: str = backend_setting()
-    device: str = device_setting()
 
     @property
     def antialias(self) -> bool:

@@ -178,13 +178,12 @@ def test_cameras_of_a_split_are_not_refined(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_opengl_axes_are_refused_by_their_name(tmp_path: Path) -> None:
+def test_opengl_axes_where_a_model_has_others_are_refused(tmp_path: Path) -> None:
     turn = np.diag([1.0, -1.0, -1.0, 1.0])
     cameras = model(tmp_path / "cameras", lambda pose: turn @ pose, 5)
     with pytest.raises(SplatError) as caught:
         reconstructed(tmp_path / "sfm", cameras)
     assert caught.value.code == "cameras-do-not-fit"
-    assert "y and z of each camera are negated" in caught.value.hint
 
 
 @pytest.mark.slow
