@@ -34,8 +34,12 @@ class CommandGroup(TyperGroup):
             status = super().main(
                 args, prog_name, complete_var, False, windows_expand_args, **extra
             )
+            with console.output_written():
+                sys.stdout.flush()  # of help and version, which the parser prints
         except SplatError as error:
             status = console.show_error(error)
+        except OSError as error:
+            status = console.show_error(console.output_lost(error))
         except _UsageError as error:
             if type(error).__name__ == "NoArgsIsHelpError":  # it has shown the help
                 status = int(Family.USAGE)

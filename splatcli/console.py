@@ -5,9 +5,11 @@ from __future__ import annotations
 import functools
 import json
 import os
+import re
 import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,9 +22,33 @@ from rich.table import Table
 from rich.text import Text
 
 from splatcli import log
-from stages.base.errors import CRASHED, STOPPED, Interrupted, SplatError
+from stages.base.errors import CRASHED, STOPPED, Interrupted, ResourceError, SplatError, UsageError
 from stages.base.text import printable, printable_name
 from stages.run.failures import as_splat_error
+
+
+@contextmanager
+def output_written() -> Iterator[None]:
+    """Raise SplatError "output-not-written" where the system refuses what the block prints."""
+    try:
+        yield
+    except BrokenPipeError:  # the reader has seen enough
+        raise
+    except OSError as error:
+        raise output_lost(error) from error
+
+
+def output_lost(error: OSError) -> SplatError:
+    """The error for output that was refused. What is printed later on standard output is lost, so
+    that the end of the process does not fail as well."""
+    with suppress(OSError, ValueError):  # of a standard output that is no file
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return ResourceError(
+        "output-not-written",
+        given=f"What the command prints could not be written: {error.strerror or error}.",
+        wanted="A standard output that takes it.",
+        hint="Free some space where it goes, or print to another file.",
+    )
 
 
 class _Screen(Console):
@@ -35,10 +61,15 @@ class _Screen(Console):
         for part in super().render(renderable, options):
             yield part if part.control else Segment(printable(part.text), part.style)
 
+    def print(self, *objects: Any, **how: Any) -> None:
+        with output_written():
+            super().print(*objects, **how)
+
 
 out = _Screen(highlight=False, soft_wrap=True)
 err = _Screen(stderr=True, highlight=False, soft_wrap=True)
 
+_URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")  # a Windows drive has one letter
 LOSSLESS_DB = 99.0  # the PSNR that is recorded for equal pictures
 
 
@@ -59,9 +90,23 @@ mode = Mode()  # of this process, which runs one command
 
 
 def emit(event: str, **values: Any) -> None:
-    """One line of JSON on standard output."""
-    sys.stdout.write(json.dumps({"event": event, **values}) + "\n")
-    sys.stdout.flush()
+    """One line of JSON on standard output. Raises SplatError (output-not-written)."""
+    with output_written():
+        sys.stdout.write(json.dumps({"event": event, **values}) + "\n")
+        sys.stdout.flush()
+
+
+def _refuse_urls(values: Mapping[str, Any]) -> None:
+    """Raise SplatError (url-not-local) for a path that is a URL, of which `Path` left one slash."""
+    for value in values.values():
+        if isinstance(value, Path) and _URL.match(str(value)) and not value.exists():
+            raise UsageError(
+                "url-not-local",
+                given=f"{str(value).replace(':/', '://', 1)} is a URL.",
+                wanted="A file or folder of this machine.",
+                hint="`splat batch` reads captures from URLs and writes runs to them: splat batch "
+                "PHOTOS --out URL. Copy other files first.",
+            )
 
 
 def guarded(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -73,6 +118,7 @@ def guarded(command: Callable[..., Any]) -> Callable[..., Any]:
         try:
             if values.pop("verbose", False):
                 _start_log()
+            _refuse_urls(values)
             command(**values)
         except SplatError as error:
             log.write_failure(error)
@@ -105,9 +151,10 @@ def _start_log() -> None:
 
 def show_error(error: SplatError) -> int:
     """Print an error; returns the exit status."""
-    if mode.as_json:
-        emit("error", **error.as_dict())
-        return int(error.family)
+    if mode.as_json and error.code != "output-not-written":
+        with suppress(SplatError):  # it is printed below, for a reader
+            emit("error", **error.as_dict())
+            return int(error.family)
     err.print(Text("Error: ", style="bold red") + Text(printable_name(error.given)))
     err.print(Text("Wanted: ", style="bold") + Text(printable_name(error.wanted)))
     err.print(Text("Next: ", style="bold") + Text(printable_name(error.hint)))

@@ -29,6 +29,13 @@ from stages.run.runfile import RUN_FILE
 from stages.train.checkpoint import FILE_NAME
 
 Location: TypeAlias = Path | str  # a path, or a URL
+_FAMILIES = {
+    "url-unknown": Family.USAGE,
+    "url-not-installed": Family.USAGE,
+    "url-not-found": Family.INPUT,
+    "url-not-permitted": Family.RESOURCES,
+    "url-failed": Family.RESOURCES,
+}
 
 
 def parse_location(text: str) -> Location:
@@ -172,7 +179,7 @@ class RemoteFolder:
                 raise disk_full("copying", Path(tempfile.gettempdir())) from error
             what = f"{type(error).__name__}: {error}".splitlines()[0].rstrip(".")
             hint = "Give the same command again: what is finished is kept."
-            raise _error("url-failed", self.url, what, hint, Family.RESOURCES) from error
+            raise _error("url-failed", self.url, what, hint) from error
 
     def _not_permitted(self) -> SplatError:
         hint = "Check your rights there, and that credentials are set where the worker runs."
@@ -184,9 +191,11 @@ def _missing(url: str) -> SplatError:
     return _error("url-not-found", url, "Nothing is there", hint)
 
 
-def _error(code: str, url: str, what: str, hint: str, family: Family = Family.INPUT) -> SplatError:
+def _error(code: str, url: str, what: str, hint: str) -> SplatError:
     wanted = "A URL that fsspec can read, and write to where runs go."
-    return SplatError(code, given=f"{url}: {what}.", wanted=wanted, hint=hint, family=family)
+    return SplatError(
+        code, given=f"{url}: {what}.", wanted=wanted, hint=hint, family=_FAMILIES[code]
+    )
 
 
 @contextmanager

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import sys
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from splatcli import api, console
+from splatcli.app import app
 from stages.base.distribution import NAME, VERSION
 from stages.base.errors import Interrupted, SplatError
 from stages.raster.gpu import device as gpu
@@ -20,6 +22,7 @@ from stages.run.lock import locked
 from stages.run.pipeline import Pipeline
 from tests.cameras.drawn import nerfstudio as drawn_transforms
 from tests.cameras.models import example
+from tests.processes import ROOT
 
 STAGES = ("ingest", "sfm", "seed", "train", "prune", "quantise", "export")
 
@@ -83,6 +86,29 @@ def test_exporting_one_more_format_keeps_those_that_are_there(splat, again: str)
         splat(*(again, "run", "--format", "glb"))
     manifest = json.loads(Path("run/7-export/manifest.json").read_text())
     assert manifest["settings"]["formats"] == ["ply", "glb"]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no such device here")
+@pytest.mark.parametrize(
+    "words", ["status run", "status run --json", "status --help", "--version", "nope --json"]
+)
+def test_output_that_cannot_be_written_is_one_error(splat, monkeypatch, capsys, words: str) -> None:
+    splat("process", "photos")
+    with Path("/dev/full").open("w") as full, monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", full)
+        with pytest.raises(SystemExit) as end:
+            app(words.split())
+    assert end.value.code == (2 if words.startswith("nope") else 6)
+    told = capsys.readouterr().err
+    assert ("command-line" if words.startswith("nope") else "output-not-written") in told
+
+
+def test_code_of_photographs_that_are_not_there_is_the_documented_one(splat) -> None:
+    result = splat("process", "nope")
+    text = (ROOT / "docs" / "guide" / "troubleshooting.md").read_text(encoding="utf-8")
+    row = next(row for row in text.splitlines() if row.startswith("| `photographs-missing`"))
+    assert "photographs-missing" in result.stderr
+    assert "at the path given" in row
 
 
 def test_newest_splats_are_made_from_what_lies_there(splat) -> None:

@@ -163,6 +163,23 @@ def test_a_folder_here_and_a_url_go_together(splat, store, tmp_path) -> None:
     assert (tmp_path / "here" / "room" / "7-export" / "manifest.json").is_file()
 
 
+def documented_status(code: str) -> int:
+    """The exit status that the table of codes has in brackets."""
+    text = (processes.ROOT / "docs" / "guide" / "troubleshooting.md").read_text(encoding="utf-8")
+    row = next(line for line in text.splitlines() if line.startswith(f"| `{code}` |"))
+    return int(row.split("(")[1].split(")")[0])
+
+
+@pytest.mark.parametrize(
+    "words", [("process", "photos", "--out"), ("process",), ("convert", "a.ply")]
+)
+def test_a_url_where_a_path_is_wanted_is_refused(splat, store, words: tuple[str, ...]) -> None:
+    result = splat(*words, "s3://bucket/run")
+    assert result.exit_code == documented_status("url-not-local")
+    assert "s3://bucket/run is a URL" in result.stderr
+    assert not Path("s3:").exists()
+
+
 @pytest.mark.parametrize(
     ("url", "code"),
     [
@@ -176,7 +193,7 @@ def test_a_url_that_cannot_be_used_is_said_before_anything_starts(splat, store, 
     if code == "url-not-installed" and "s3fs" in sys.modules:
         pytest.skip("s3fs is installed")
     result = splat("batch", url, "--out", "runs")
-    assert result.exit_code == 3
+    assert result.exit_code == documented_status(code)
     assert code in result.stderr
     assert not Path("runs").exists()
 
@@ -202,7 +219,7 @@ def test_rights_that_are_missing_are_told(splat, store, monkeypatch, reason: Exc
 
     monkeypatch.setattr(store, "put_file", refused)
     result = batch(splat)
-    assert result.exit_code == 3
+    assert result.exit_code == documented_status("url-not-permitted")
     assert "url-not-permitted" in result.stderr
 
 
