@@ -8,6 +8,7 @@ leaf after the other, and sort the rows of a leaf along a Morton curve.
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import re
@@ -39,6 +40,7 @@ _CHUNK_FILES = (
     *("meta.json", "means_l.webp", "means_u.webp", "quats.webp", "scales.webp", "sh0.webp"),
     *("shN_centroids.webp", "shN_labels.webp"),
 )
+_OF_PAGE = b'"content": "lod-meta.json"'  # in the data of the asset's page
 _Rows = NDArray[np.intp]
 
 
@@ -68,8 +70,9 @@ def write(
     coarser: Sequence[Splats] = (),
 ) -> None:
     """Write a streamed SOG and, beside it, a page that shows it on any web server. Makes the
-    folder, replaces an earlier asset in it, and writes lod-meta.json last. Of the earlier asset
-    only files of SOG in the folders that its lod-meta.json names are removed.
+    folder. The chunks get names that nothing has, then lod-meta.json replaces that of an earlier
+    asset, so that one of the two is whole at any time. Of the earlier asset only files of SOG in
+    the folders that its lod-meta.json names are removed.
 
     Args:
         path: the asset's lod-meta.json.
@@ -78,30 +81,33 @@ def write(
         views: cameras of the page.
         coarser: coarser levels of detail of the same scene, finest first, all drawable.
 
-    Raises SplatError when the asset cannot be written, and "lod-folder-taken" if a folder with the
-    name of a chunk exists that is not the earlier asset's.
+    Raises SplatError when the asset cannot be written, and "lod-folder-taken" if a page of another
+    kind has the name of the asset's.
     """
+    _refuse_taken(path.with_suffix(".html"))
     levels = [splats, *coarser]
     make_folder(path.parent)
     tree = _cut(levels)
     partial = path.with_name(partial_prefix() + "chunks")
+    folders: list[Path] = []
     try:
         make_folder(partial)
         names = _write_chunks(partial, list(_leaves(tree)), levels, units)
-        meta = _meta(tree, levels, names, units)
+        folders = _free_folders(path, names)
+        meta = _meta(tree, levels, [f"{new.name}/meta.json" for new in folders], units)
         earlier = _chunk_folders(path)
-        _refuse_taken(path, partial, earlier)
         with replacing(path) as temporary:
             temporary.write_text(json.dumps(meta, allow_nan=False), encoding="utf-8")
-            path.unlink(missing_ok=True)  # it must never refer to other chunks
-            for old in earlier:
-                _remove_chunk(old)
-            for new in sorted(partial.iterdir()):
-                path.with_name(new.name).mkdir(exist_ok=True)
-                for file in new.iterdir():
-                    os.replace(file, path.with_name(new.name) / file.name)
+            for name, new in zip(names, folders, strict=True):
+                (partial / name).parent.rename(new)
+    except BaseException:
+        for new in set(folders) - _chunk_folders(path):
+            shutil.rmtree(new, ignore_errors=True)
+        raise
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+    for old in earlier:
+        _remove_chunk(old)
     html.write_beside(path, splats, units, views, splat_widths(path, splats))
 
 
@@ -133,24 +139,26 @@ def _chunk_folders(path: Path) -> set[Path]:
     return {folder for folder in folders if folder.is_dir() and not folder.is_symlink()}
 
 
-def _refuse_taken(path: Path, partial: Path, earlier: set[Path]) -> None:
-    """Raise SplatError "lod-folder-taken" if a chunk in `partial` has the name of something beside
-    `path` that is not of the `earlier` asset, and no chunk that an interrupted write left."""
-    for chunk in sorted(partial.iterdir()):
-        place = path.with_name(chunk.name)
-        if os.path.lexists(place) and place not in earlier and not _holds_only_sog(place):
-            raise UsageError(
-                "lod-folder-taken",
-                given=f"{place} exists and is not a part of an asset at {path}.",
-                wanted="A folder in which the chunks of the asset overwrite nothing.",
-                hint="Name another, empty folder.",
-            )
+def _refuse_taken(page: Path) -> None:
+    """Raise SplatError "lod-folder-taken" if `page` exists and is not the page of an asset."""
+    if page.is_file() and _OF_PAGE not in page.read_bytes():
+        raise UsageError(
+            "lod-folder-taken",
+            given=f"{page} exists and is not the page of an asset.",
+            wanted="A folder in which the files of the asset overwrite nothing.",
+            hint="Name another, empty folder.",
+        )
 
 
-def _holds_only_sog(folder: Path) -> bool:
-    if folder.is_symlink() or not folder.is_dir():
-        return False
-    return all(file.name in _CHUNK_FILES for file in folder.iterdir())
+def _free_folders(path: Path, names: Sequence[str]) -> list[Path]:
+    """A folder beside `path` for each of the chunks `names`: with the same number added to all, so
+    that nothing has their names."""
+    for first in itertools.count():
+        parts = (name.partition("/")[0].split("_") for name in names)
+        found = [path.with_name(f"{level}_{int(number) + first}") for level, number in parts]
+        if not any(os.path.lexists(folder) for folder in found):
+            return found
+    raise AssertionError
 
 
 def _remove_chunk(folder: Path) -> None:

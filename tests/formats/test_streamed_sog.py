@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import shutil
 import zipfile
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -118,7 +120,7 @@ def test_an_asset_takes_the_place_of_an_earlier_one(asset: Path) -> None:
     levels.write(asset, many_splats(100))
     assert len(formats.read(asset)) == 100
     names = {path.name for path in asset.parent.iterdir()}
-    assert names == {"lod-meta.json", "lod-meta.html", "0_0", "notes.txt"}
+    assert names == {"lod-meta.json", "lod-meta.html", "0_3", "notes.txt"}
     row = formats.format_of(asset)
     assert row.size_bytes(asset) == sum(p.stat().st_size for p in asset.parent.rglob("*.*")) - 4
 
@@ -133,30 +135,61 @@ def test_an_asset_removes_and_counts_nothing_that_the_earlier_one_does_not_name(
     levels.write(asset, many_splats(100))
     assert [path.read_text() for path in mine] == ["mine", "mine"]
     assert len(formats.read(asset)) == 100
-    assert {path.name for path in asset.parent.iterdir() if path.is_dir()} == {"0_0", "2024_05"}
+    assert {path.name for path in asset.parent.iterdir() if path.is_dir()} == {
+        "0_0",
+        "0_3",
+        "2024_05",
+    }
     assert mine[0] not in formats.format_of(asset).files(asset)
 
 
 @pytest.mark.parametrize("earlier", [None, "no JSON", "5", '{"filenames": ["../0_0/meta.json"]}'])
-def test_a_folder_of_the_user_s_is_refused_before_anything_changes(
-    tmp_path: Path, earlier: str | None
+@pytest.mark.parametrize("mine", ["0_0/photo.webp", "0_0/meta.json"])
+def test_a_folder_of_the_user_s_is_left_alone(
+    tmp_path: Path, earlier: str | None, mine: str
 ) -> None:
     path = tmp_path / "lod-meta.json"
     (tmp_path / "0_0").mkdir()
-    (tmp_path / "0_0" / "photo.webp").write_text("mine")
+    (tmp_path / mine).write_text("mine")
     if earlier is not None:
         path.write_text(earlier)
-    before = {file: file.read_bytes() for file in tmp_path.rglob("*.*")}
+    levels.write(path, many_splats(100))
+    assert (tmp_path / mine).read_text() == "mine"
+    assert [file.name for file in (tmp_path / "0_0").iterdir()] == [Path(mine).name]
+    assert len(formats.read(path)) == 100
+
+
+def test_a_page_of_the_user_s_is_refused_before_anything_changes(tmp_path: Path) -> None:
+    (tmp_path / "lod-meta.html").write_text("mine")
     with pytest.raises(SplatError) as refused:
-        levels.write(path, many_splats(100))
+        levels.write(tmp_path / "lod-meta.json", many_splats(100))
     assert (refused.value.code, refused.value.family) == ("lod-folder-taken", Family.USAGE)
-    assert {file: file.read_bytes() for file in tmp_path.rglob("*.*")} == before
+    assert [file.name for file in tmp_path.iterdir()] == ["lod-meta.html"]
+    assert (tmp_path / "lod-meta.html").read_text() == "mine"
 
 
-def test_chunks_that_an_interrupted_write_left_are_replaced(asset: Path) -> None:
-    asset.unlink()
-    levels.write(asset, many_splats(100))
-    assert len(formats.read(asset)) == 100
+@pytest.mark.parametrize("calls", range(7))
+def test_a_stop_at_any_rename_or_removal_leaves_one_whole_asset(
+    asset: Path, monkeypatch: pytest.MonkeyPatch, calls: int
+) -> None:
+    left, remove = [calls], streamed_sog._remove_chunk
+
+    def dying(call):
+        def changed(*given, **more):
+            if call == remove or Path(given[1]).parent == asset.parent:
+                left[0] -= 1
+                if left[0] < 0:
+                    raise KeyboardInterrupt
+            return call(*given, **more)
+
+        return changed
+
+    with monkeypatch.context() as patch, suppress(KeyboardInterrupt):
+        patch.setattr(Path, "rename", dying(Path.rename))
+        patch.setattr(os, "replace", dying(os.replace))
+        patch.setattr(streamed_sog, "_remove_chunk", dying(remove))
+        levels.write(asset, many_splats(100))
+    assert len(formats.read(asset)) == (2000 if calls < 2 else 100)
 
 
 def test_no_splats_at_all_are_an_asset_too(tmp_path: Path) -> None:
