@@ -15,8 +15,9 @@ from stages.base import scratch
 from stages.base.atomic import make_folder
 from stages.base.errors import UsageError
 from stages.formats import format_of
-from stages.formats.losses import losses_of
-from stages.proof.losses import losses_shown
+from stages.formats.replacement import replacing_asset
+from stages.formats.values import nothing_drawable
+from stages.proof.losses import require_proven
 from stages.proof.prover import Prover, cameras_for
 from stages.run import results
 from stages.scene import Splats
@@ -39,17 +40,15 @@ def convert(
     with scratch.scratch_in(nearest, spare=True):
         console.step(f"reading {source}", done=0, total=_STEPS)
         splats, dropped = formats.read_drawable(source)
-        _refuse_nothing(source, target, splats)
+        _refuse_nothing(source, target, splats, dropped)
         console.step(f"writing {target}", done=1, total=_STEPS)
         make_folder(target.parent)
-        formats.write(target, splats, units=formats.units_of(source))
-        warnings = [*losses_of(rows[1], target.name, splats).values()]
-        console.step(f"comparing {target}", done=2, total=_STEPS)
-        found, loss = _proven(source, target, splats)
-        warnings += [loss] if loss else []
-        if "plain_drawing_db" in found:
-            db = found["plain_drawing_db"]
-            warnings.append(f"Drawn plainly, {target.name} differs by {db} dB from {source.name}.")
+        with replacing_asset(target) as written:
+            formats.write(written, splats, units=formats.units_of(source))
+            console.step(f"comparing {target}", done=2, total=_STEPS)
+            cameras = cameras_for(splats, results.views_of(results.run_around(source)))
+            prover = Prover.of(splats, cameras, source_format=rows[0].ending)
+            found, losses = require_proven(written, prover, "convert-verify-failed")
     size = rows[1].size_bytes(target)
     facts: dict[str, Any] = {
         "source": str(source),
@@ -60,24 +59,27 @@ def convert(
         "bytes_per_splat": round(size / max(1, len(splats)), 2),
         "seconds": round(time.monotonic() - begun, 2),
         **found,
-        "warnings": warnings,
+        "warnings": [*losses.values()],
     }
     if console.mode.as_json:
         console.emit("converted", **facts)
         return
     if dropped:
         console.warn(f"Warning: {dropped} splats that no viewer can draw were left out.")
-    for warning in warnings:
+    for warning in losses.values():
         console.warn(f"Warning: {warning}")
     _show(facts, found)
 
 
-def _refuse_nothing(source: Path, target: Path, splats: Splats) -> None:
-    """Raise SplatError "convert-nothing" where the new file would have no bytes at all."""
+def _refuse_nothing(source: Path, target: Path, splats: Splats, dropped: int) -> None:
+    """Raise SplatError "convert-nothing" where none of the splats can be drawn, and where the new
+    file would have no bytes at all."""
+    if dropped and not len(splats):
+        raise nothing_drawable(source, dropped)
     if format_of(target).ending == "splat" and not len(splats):
         raise UsageError(
             "convert-nothing",
-            given=f"{source} holds no splats that can be drawn.",
+            given=f"{source} holds no splats.",
             wanted="At least one: a .splat without splats has no bytes, and nothing reads it.",
             hint="Write another format: all others have a header.",
         )
@@ -90,16 +92,3 @@ def _show(facts: dict[str, Any], found: dict[str, Any]) -> None:
     worst = {name: found[name] for name in found if name.startswith("max_") and found[name] > 0}
     if worst and not console.mode.quiet:
         console.note(f"Largest differences: {console.figures(worst)}", "dim")
-
-
-def _proven(source: Path, target: Path, splats: Splats) -> tuple[dict[str, Any], str]:
-    """(the figures of the comparison, a warning of what was lost or "").
-    Raises SplatError "convert-verify-failed"."""
-    cameras = cameras_for(splats, results.views_of(results.run_around(source)))
-    prover = Prover.of(splats, cameras, source_format=format_of(source).ending)
-    proof = prover.require(target, "convert-verify-failed")
-    figures = proof.figures
-    if splats.draw_settings.antialias and not format_of(target).drawn_antialiased:
-        figures = figures | {"plain_drawing_db": round(prover.plain_drawing_db(), 2)}
-    loss = losses_shown(format_of(target), proof, splats)
-    return figures, loss and f"{target.name} differs visibly from {source.name}: {loss}"

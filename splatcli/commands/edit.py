@@ -23,8 +23,9 @@ from stages.editing.scene import EditedScene
 from stages.editing.syntax import ParsedOperation
 from stages.evaluate.evaluation import load_evaluation_views
 from stages.formats import format_of, units_of
-from stages.formats.losses import losses_of
-from stages.formats.values import drop_undrawable
+from stages.formats.replacement import replacing_asset
+from stages.formats.values import drop_undrawable, nothing_drawable
+from stages.proof.losses import require_proven
 from stages.proof.prover import Prover, cameras_for
 from stages.run import results
 from stages.scene import split_held_out
@@ -86,14 +87,11 @@ def _edit(
         if start_db is not None:
             facts |= {"psnr_before_db": round(start_db, 3), "psnr_db": _db(scene)}
         if not dry_run:
-            views = scene.placed_views()
-            unwritten = levels.write(target, scene.splats, units=scene.units, views=views)
+            unwritten, figures, losses = _written(source, target, scene)
             left_out += unwritten
-            facts |= {"splats": len(scene.splats) - unwritten}
+            facts |= {"splats": len(scene.splats) - unwritten, **figures}
             facts |= {"target": str(target), "size_bytes": row.size_bytes(target)}
-            warnings.extend(losses_of(row, target.name, scene.splats).values())
-            if views:
-                facts |= _proven(source, target, scene)
+            warnings.extend(losses.values())
     if left_out:
         what = counted(left_out, "splat")
         warnings.append(f"Left out, because of values that no viewer can draw: {what}.")
@@ -108,6 +106,8 @@ def _load_scene(source: Path, antialias: bool) -> tuple[EditedScene, int]:
     splats, dropped = drop_undrawable(splats)
     if dropped > len(splats):
         load_target(source, antialias=antialias)  # says which values are not finite
+    if dropped and not len(splats):
+        raise nothing_drawable(source, dropped)
     if pipeline is None or pipeline.manifest("sfm") is None:
         return EditedScene(splats, units_of(source)), dropped
     found = pipeline.load("sfm")
@@ -121,14 +121,19 @@ def _load_scene(source: Path, antialias: bool) -> tuple[EditedScene, int]:
     return scene, dropped
 
 
-def _proven(source: Path, target: Path, scene: EditedScene) -> dict[str, Any]:
-    """The figures of comparing `target`, read by a second parser, with the splats. Raises
-    SplatError "edit-verify-failed"."""
-    splats = drop_undrawable(scene.splats)[0]
+def _written(
+    source: Path, target: Path, scene: EditedScene
+) -> tuple[int, dict[str, Any], dict[str, str]]:
+    """Write `target` and compare it, read by a second parser, with the splats: (how many cannot be
+    drawn, figures, losses). Raises SplatError "edit-verify-failed"."""
+    views, (splats, left_out) = scene.placed_views(), drop_undrawable(scene.splats)
     source_format = format_of(source).ending if source.is_file() else ""
-    cameras = cameras_for(splats, scene.placed_views())
-    prover = Prover.of(splats, cameras, scene.backend, source_format)
-    return prover.require(target, "edit-verify-failed").figures
+    if left_out and not len(splats):
+        raise nothing_drawable(target, left_out)
+    with replacing_asset(target) as written:
+        levels.write(written, splats, units=scene.units, views=views)
+        prover = Prover.of(splats, cameras_for(splats, views), scene.backend, source_format)
+        return left_out, *require_proven(written, prover, "edit-verify-failed")
 
 
 def _db(scene: EditedScene) -> float | None:

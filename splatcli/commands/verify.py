@@ -18,6 +18,7 @@ from stages.formats import format_of
 from stages.formats.mesh_table import MESHES
 from stages.formats.sog_quantisation import splats_to_write
 from stages.formats.values import drop_undrawable
+from stages.proof.losses import changes_shown
 from stages.proof.prover import Proof, Prover, cameras_for, provers_of
 from stages.run import results, runfolder
 from stages.run.pipeline import Pipeline
@@ -69,6 +70,7 @@ def verify(
         formats.format_of(file)  # raises before any work is done
     console.note_compiling()
     original, found = None, []
+    losses: list[str] = []
     for number, file in enumerate(files):
         console.step(f"verifying {file}", done=number, total=len(files))
         # Our own reader first: it reports damage that makes other parsers crash.
@@ -80,11 +82,12 @@ def verify(
             if not proof.fault:
                 break
         found.append((file, proof))
+        losses += [] if proof.fault else changes_shown(file, prover.splats, proof).values()
         if console.mode.as_json:
             console.emit("verified", **_facts(file, proof, original))
     assert original is not None
     if not console.mode.as_json:
-        _print(found, original)
+        _print(found, original, losses)
     _raise_if_wrong(found, original)
 
 
@@ -161,7 +164,7 @@ def _facts(file: Path, proof: Proof, original: _Original) -> dict[str, Any]:
     }
 
 
-def _print(found: list[tuple[Path, Proof]], original: _Original) -> None:
+def _print(found: list[tuple[Path, Proof]], original: _Original, losses: list[str]) -> None:
     facts = [_facts(file, proof, original) for file, proof in found]
     if console.mode.quiet:
         for each in facts:
@@ -189,9 +192,8 @@ def _print(found: list[tuple[Path, Proof]], original: _Original) -> None:
                 f"Warning: {file.name} {_UNCHECKED}: the second reader does not understand "
                 f"{proof.unchecked}. The first one found the file whole."
             )
-        if proof.loss_db is not None:
-            loss = f"{file.name} shows: it differs by {proof.loss_db:.1f} dB. {_why(file)}"
-            console.warn(f"Warning: {loss}")
+    for loss in losses:
+        console.warn(f"Warning: {loss}")
 
 
 def _verdict(facts: dict[str, Any]) -> str:
@@ -216,11 +218,6 @@ def _label(name: str) -> str:
         what, _, unit = name.removeprefix("max_").partition("_error")
         return f"{console.label(what)} off by" + unit.replace("_", ", ")
     return labels.get(name, console.label(name))
-
-
-def _why(file: Path) -> str:
-    why = format_of(file).loses
-    return f"The format {why}." if why else "The original had lost more already."
 
 
 def _raise_if_wrong(found: list[tuple[Path, Proof]], original: _Original) -> None:

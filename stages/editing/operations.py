@@ -28,6 +28,8 @@ Operation = Callable[[EditedScene], EditedScene]
 _AXES = {"x": (1.0, 0, 0), "y": (0, 1.0, 0), "z": (0, 0, 1.0)}
 _ATTEMPTS = 8  # to meet a size: one or two are enough where bytes grow with splats
 _SAFETY = 0.995
+# Rounding of a position shows from this share of the splat's size; few splats may show it.
+_SHOWN, _FEW = 0.25, 0.01
 
 
 def prepare_operations(
@@ -134,7 +136,8 @@ def join(first: Splats, second: Splats) -> Splats:
     """Both in one, in the frame and with the draw settings of `first`, at the higher SH degree.
     The origins of both are in the coordinates of the capture.
 
-    Raises SplatError "edit-drawing-differs" if only one is to be drawn with opacity compensation.
+    Raises SplatError "edit-drawing-differs" if only one is to be drawn with opacity compensation,
+    and "edit-merge-far" if they are so far apart that float32 rounds the second's positions.
     """
     if first.draw_settings.antialias != second.draw_settings.antialias:
         which = "second" if second.draw_settings.antialias else "first"
@@ -144,9 +147,27 @@ def join(first: Splats, second: Splats) -> Splats:
             wanted="Splats that are drawn in the same way: together, one half would look wrong.",
             hint="Export one of them again: splat export --drawing plain (or antialiased).",
         )
-    means = (second.means + (second.origin - first.origin)).astype(first.means.dtype)
+    exact = second.means + (second.origin - first.origin)
+    means = exact.astype(first.means.dtype)
+    _refuse_rounded(np.abs(exact - means).max(axis=1, initial=0.0), exact, second)
     both = concatenate([first, replace(second, means=means)])
     return replace(both, origin=first.origin, place=first.place, draw_settings=first.draw_settings)
+
+
+def _refuse_rounded(
+    errors: NDArray[np.float64], means: NDArray[np.float64], splats: Splats
+) -> None:
+    """Raise SplatError "edit-merge-far" if more than few of the `errors` [N] of positions show.
+    means: [N, 3] in the coordinates of the first file."""
+    shown = errors > _SHOWN * np.exp(splats.log_scales.max(axis=1, initial=-np.inf))
+    if np.count_nonzero(shown) > _FEW * len(shown):
+        raise UsageError(
+            "edit-merge-far",
+            given=f"The two lie {np.linalg.norm(np.median(means, axis=0)):,.0f} units apart, where "
+            f"32 bits round positions by {errors.max():.2g} units.",
+            wanted="Files whose coordinates have the same zero point.",
+            hint="--move X,Y,Z before --merge moves the first to the second.",
+        )
 
 
 def decimate_scene(scene: EditedScene, count: int) -> Splats:

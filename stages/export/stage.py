@@ -19,9 +19,8 @@ from stages.base.errors import Interrupted, QualityError, SplatError
 from stages.base.stage import Report
 from stages.base.text import counted
 from stages.export.settings import ExportSettings
-from stages.formats import Format, format_of
+from stages.formats import format_of
 from stages.formats.format_table import FORMATS
-from stages.formats.losses import losses_of
 from stages.formats.mesh_files import CODECS_OF_MESHES
 from stages.formats.output_formats import (
     mesh_formats,
@@ -29,6 +28,7 @@ from stages.formats.output_formats import (
 from stages.formats.sog_quantisation import splats_to_write
 from stages.formats.values import drop_undrawable
 from stages.mesh.collision_mesh import make_collision_mesh
+from stages.proof.losses import losses_of
 from stages.proof.prover import Prover, cameras_for, provers_of
 from stages.raster.backends import (
     report_backend,
@@ -65,7 +65,6 @@ def run(
         path = folder / f"{settings.name}.{name}"
         held = replace(splats_to_write(FORMATS[name], quantised), place=place)
         formats.write(path, held, units=reconstruction.units, views=reconstruction.views)
-        _warn_of_losses(FORMATS[name], path, held, report)
         size = FORMATS[name].size_bytes(path)
         files.append(ExportedFile(name, path.name, size))
         figures[name] = {
@@ -128,27 +127,18 @@ def _warn_of_missing(count: int, dropped: int, report: Report) -> None:
         )
 
 
-def _warn_of_losses(row: Format, path: Path, splats: Splats, report: Report) -> None:
-    for code, text in losses_of(row, path.name, splats).items():
-        report.warn(f"export-{row.ending.replace('.', '-')}-{code}", text)
-
-
 def _write_index(folder: Path, files: list[ExportedFile]) -> None:
     entries = [asdict(file) for file in files]
     (folder / _INDEX).write_text(json.dumps(entries, indent=1) + "\n", encoding="utf-8")
 
 
 def _prove(prover: Prover, path: Path, report: Report) -> dict[str, Any]:
-    """The file's figures. Raises SplatError "export-verify-failed"."""
-    row, proof = format_of(path), prover.prove(path)
+    """The file's figures; warns of what it lost. Raises SplatError "export-verify-failed"."""
+    proof = prover.prove(path)
     if proof.fault:
         raise _failed(path, proof.fault, "splats")
-    if proof.loss_db is not None:
-        report.warn(
-            f"export-{row.ending.replace('.', '-')}-lossy",
-            f"{path.name} differs from the trained splats by {proof.loss_db:.1f} dB: the format "
-            f"{row.loses}. Where a viewer reads them, prefer .ply, .glb or .usdz.",
-        )
+    for code, text in losses_of(path, prover.splats, proof).items():
+        report.warn(f"export-{format_of(path).ending.replace('.', '-')}-{code}", text)
     return proof.figures
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,10 +30,6 @@ from stages.scene import Splats
 from stages.scene.morton import morton_order
 
 
-def _nothing(splats: Splats) -> str:
-    return ""
-
-
 @dataclass(frozen=True)
 class Codec:
     """The functions of one format.
@@ -45,22 +42,37 @@ class Codec:
             whose files declare them in text at their start, or not at all.
         order: (splats) -> [N] the row of `splats` that each row of the file comes from; None if the
             format keeps the order.
-        position_loss: (splats) -> what far splats do to the positions, as the end of "the file
-            ...", or "".
-        size_loss: (splats) -> what happens to splats that are too small, as the end of "the file
-            ...", or "".
+        positions: how positions are held, as the end of "the format ...".
+        log_sizes: the least and the greatest ln of a standard deviation that it holds.
+        most_sh: the largest magnitude of a coefficient above degree 0 that it holds.
     """
 
     write: Callable[..., None]
     read: Callable[[Path], Splats]
     units: Callable[[Path], str] | None = None
     order: Callable[[Splats], NDArray[np.intp]] | None = None
-    position_loss: Callable[[Splats], str] = _nothing
-    size_loss: Callable[[Splats], str] = _nothing
+    positions: str = "holds positions of 32 bits, in coarser steps the farther from zero they are"
+    log_sizes: tuple[float, float] = (-math.inf, math.inf)
+    most_sh: float = math.inf
+
+    def size_loss(self, splats: Splats) -> tuple[str, str]:
+        """What sizes it holds, as the end of "the format ...", and the advice that brings those of
+        `splats` into this range; ("", "") if it holds them all."""
+        low, high = self.log_sizes
+        largest = splats.log_scales.max(axis=1, initial=-np.inf)
+        if not len(largest) or (low <= largest.min() and largest.max() <= high):
+            return "", ""
+        why = f"holds sizes from {math.exp(low):.2g} to {math.exp(high):.3g} units"
+        few = np.quantile(largest, _FEW)
+        tens = [math.floor((high - largest.max()) / _TEN), math.ceil((low - few) / _TEN)]
+        power = min(tens[0], 0) or max(tens[1], 0)
+        return why, f"`splat edit --scale 1e{power}` brings them into that range" if power else ""
 
 
 _GLTF = Codec(gltf.write, gltf_read.read)
+_FEW, _TEN = 0.01, math.log(10)  # a share of splats that may be too small to be seen
 _USD = Codec(usd.write, usd_read.read)
+_SIZES = (-compressed_ply.LOG_SCALE_LIMIT, compressed_ply.LOG_SCALE_LIMIT)
 CODECS = {
     "ply": Codec(ply.write, ply.read),
     "splat": Codec(splat32.write, splat32.read, order=splat32.order),
@@ -70,11 +82,32 @@ CODECS = {
     "usdc": replace(_USD, units=usd_read.units),
     "usdz": replace(_USD, units=usd_read.units),
     "quantised.glb": Codec(gltf_quantised.write, gltf_read.read, order=gltf_quantised.order),
-    "compressed.ply": Codec(compressed_ply.write, compressed_ply.read, order=compressed_ply.order),
-    "spz": Codec(
-        spz.write, spz_read.read, position_loss=spz.position_loss, size_loss=spz.size_loss
+    "compressed.ply": Codec(
+        compressed_ply.write,
+        compressed_ply.read,
+        order=compressed_ply.order,
+        positions="holds positions of 10 and 11 bits in the range of each 256",
+        log_sizes=_SIZES,
+        most_sh=compressed_ply.SH_LIMIT,
     ),
-    "sog": Codec(sog.write, sog_read.read, sog_read.units, morton_order, sog.position_loss),
-    "lod-meta.json": Codec(streamed_sog.write, streamed_sog.read, order=streamed_sog.order),
+    "spz": Codec(
+        spz.write,
+        spz_read.read,
+        positions="holds positions of 24 bits, and moves what lies farther out towards the origin",
+        log_sizes=spz.LOG_SIZES,
+        most_sh=1.0,
+    ),
+    "sog": Codec(
+        *(sog.write, sog_read.read, sog_read.units, morton_order),
+        positions="holds positions of 16 bits in the range of all",
+        log_sizes=_SIZES,
+    ),
+    "lod-meta.json": Codec(
+        streamed_sog.write,
+        streamed_sog.read,
+        order=streamed_sog.order,
+        positions="holds positions of 16 bits in the range of each chunk",
+        log_sizes=_SIZES,
+    ),
     "html": Codec(html.write, html.read),
 }

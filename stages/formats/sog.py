@@ -24,9 +24,7 @@ from PIL import Image
 from stages.base import scratch
 from stages.base.atomic import replacing
 from stages.base.blocks import blocks
-from stages.base.text import counted
 from stages.formats import codebook, smallest_three
-from stages.formats.compressed_ply import outlier_shells
 from stages.formats.json_fields import location_fields
 from stages.formats.sog_read import ANTIALIASED, PALETTE_LIMIT, PER_LINE
 from stages.formats.values import linear_opacities, unit_quaternions
@@ -37,7 +35,6 @@ LOG_SCALE_LIMIT = 20.0
 _PALETTE_LEAST, _SPLATS_PER_ENTRY = 1024, 4
 _DC_LIMIT = 1e4
 STEPS = 65535  # of a position, along each axis
-_COARSER_WARNED = 2.0
 
 
 def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
@@ -132,22 +129,6 @@ def position_range(means: NDArray[np.floating]) -> tuple[NDArray[np.float64], ND
         return np.zeros(3), np.zeros(3)
     # the logarithm is monotonic, so it maps the bounds to the bounds
     return symmetric_log(means.min(axis=0)), symmetric_log(means.max(axis=0))
-
-
-def position_loss(splats: Splats) -> str:
-    """By how much outliers coarsen the positions of the others; "" if by less than a factor of
-    `_COARSER_WARNED`."""
-    means = splats.means
-    outliers = outlier_shells(means) > 0
-    if not outliers.any():
-        return ""
-    all_low, all_high = position_range(means)
-    low, high = position_range(means[~outliers])
-    factor = float(((all_high - all_low) / np.maximum(high - low, 1e-30)).max())
-    if factor < _COARSER_WARNED:
-        return ""
-    count = counted(int(np.count_nonzero(outliers)), "outlier")
-    return f"holds positions {min(factor, STEPS):,.0f} times as coarse as without {count}"
 
 
 def symmetric_log(means: NDArray[np.floating]) -> NDArray[np.float64]:

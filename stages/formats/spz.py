@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.base.blocks import blocks
-from stages.base.text import counted
 from stages.formats import smallest_three
 from stages.formats.spz_read import ANTIALIASED, COLOUR_SCALE, HEADER, MAGIC, MAGNITUDE
 from stages.formats.values import linear_opacities, unit_quaternions
@@ -36,8 +35,7 @@ _USUAL_FRACTIONAL_BITS, _MOST_FRACTIONAL_BITS = 12, 23
 # between neighbouring splats.
 _STEP_OF_SPACING = 1 / 16
 _FIXED_LIMIT = (1 << 23) - 1
-_LEAST_LOG_SCALE = -10.0
-_FEW = 0.01  # a share of splats whose sizes may change unnoticed: those too small are hardly seen
+LOG_SIZES = (-10.0, -10.0 + 255 / 16)
 _SH_STEPS = (8, 16, 16)  # of 256, for degree 1, 2, 3: 5 and 4 bits, which gzip compresses
 
 
@@ -45,7 +43,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
     """Write `splats`.
 
     The format has no field for units and the origin; `formats.write` writes them beside it. A splat
-    beyond the range of 24 bits (see `position_loss`) is moved closer along its ray and scaled
+    beyond the range of 24 bits is moved closer along its ray and scaled
     down, which looks the same from the centre. Raises SplatError when the file cannot be written.
     """
     degree = int(splats.sh_degrees.max(initial=0))
@@ -56,7 +54,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
         lambda block: _positions(block, bits),
         _opacities,
         lambda block: _byte(255 * (COLOUR_SCALE * block.sh[:, 0].astype(np.float64) + 0.5)),
-        lambda block: _byte(16 * (_within_reach(block, bits).log_scales - _LEAST_LOG_SCALE)),
+        lambda block: _byte(16 * (_within_reach(block, bits).log_scales - LOG_SIZES[0])),
         lambda block: _pack_rotations(flipped(block.with_sh_degree(0)).quaternions),
         _sh,
     )
@@ -70,37 +68,6 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
         for array in arrays:
             for rows in blocks(len(splats)):
                 packed.write(np.ascontiguousarray(array(splats.take(rows))).data)
-
-
-def position_loss(splats: Splats) -> str:
-    """What happens to the splats that lie farther out than the file can hold; "" if none does."""
-    means = splats.means
-    reach = _reach(_fractional_bits(means))
-    count = sum(
-        int(np.count_nonzero(np.abs(means[rows]).max(axis=1, initial=0.0) > reach))
-        for rows in blocks(len(means))
-    )
-    if not count:
-        return ""
-    return (
-        f"holds positions of 24 bits, and {counted(count, 'splat')} of {len(splats):,} lie farther "
-        "out: they were moved towards the origin and scaled down"
-    )
-
-
-def size_loss(splats: Splats) -> str:
-    """What happens to the splats that are smaller than the file can hold; "" if few are."""
-    logs = splats.log_scales
-    count = sum(
-        int(np.count_nonzero(logs[rows].max(axis=1) < _LEAST_LOG_SCALE))
-        for rows in blocks(len(logs))
-    )
-    if count <= _FEW * len(logs):
-        return ""
-    return (
-        f"holds sizes from {math.exp(_LEAST_LOG_SCALE):.2g} units upwards, and "
-        f"{counted(count, 'splat')} of {len(logs):,} are smaller: they were enlarged to that"
-    )
 
 
 def _reach(bits: int) -> float:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from stages.base import scratch
 from stages.base.bad_files import BadFileError
 from stages.base.blocks import blocks
+from stages.base.errors import SplatError
 from stages.raster.definition import LOG_SCALE_MAX, QUATERNION_MIN
 from stages.scene import ROW_FIELDS, Splats
 
@@ -65,6 +67,16 @@ def drop_undrawable(splats: Splats) -> tuple[Splats, int]:
     """(the drawable splats, the number of others)."""
     kept = select_rows(splats, drawable_rows(splats))
     return kept, len(splats) - len(kept)
+
+
+def nothing_drawable(path: Path, dropped: int) -> SplatError:
+    """The error of a file of splats, none of which can be drawn."""
+    return SplatError(
+        "nothing-drawable",
+        given=f"None of the {dropped:,} splats of {path} can be drawn.",
+        wanted="Finite values, rotations that are not 0, and sizes whose squares fit 32 bits.",
+        hint="`splat info` says what is wrong with them.",
+    )
 
 
 def select_rows(splats: Splats, keep: NDArray[np.bool_]) -> Splats:

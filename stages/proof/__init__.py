@@ -2,6 +2,6 @@
 
 `prover` proves a file by the row of its format in `checks`: an independent reader
 (`independent_readers`, `independent_packed`) gives its `content`, `matching` finds the same splats
-in both, and `compare` measures the differences; `losses` says which of them are seen, and
+in both, and `compare` measures the differences; `losses` tells those that show, and
 `usd_validation` asks USD's own validators. `statistics` is what `splat info` prints.
 """

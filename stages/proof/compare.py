@@ -14,6 +14,7 @@ from stages.proof.content import FileContent, arrays_by_rows
 from stages.proof.matching import Rows, extent_of, matched_rows
 from stages.scene import SH_C0, Splats
 from stages.scene.flip import FLIP, flipped
+from stages.scene.quantiles import median_spacing
 
 _BLOCK = 1 << 16  # rows compared at a time: copies stay small however large the file is
 
@@ -44,6 +45,20 @@ _WRONG = {
 _THINNEST = -5.0
 _ANISOTROPIC = 0.2  # a splat has an orientation if its log scales differ by this
 
+# Changes of single splats that are worth a warning: of a position or a size by more than this share
+# of the distance between neighbours, and then of a position by more than the splat's own size, of a
+# size by this natural logarithm; of a colour by this much of 0..1, averaged over all directions.
+_STEP, _RESIZED, _RECOLOURED = 0.25, 0.2, 0.1
+
+
+@dataclass(frozen=True)
+class Change:
+    """How many splats look different in one attribute, and the largest difference among them:
+    "position" in world units, "size" as a factor, "colour" in 0..1."""
+
+    count: int
+    largest: float
+
 
 @dataclass(frozen=True)
 class Differences:
@@ -59,7 +74,7 @@ class Differences:
             the scene's extent, the others in the units of `largest`. Positions come alone, because
             without them rows cannot be matched. "sh": the squared error, relative to the squares.
         rows: [N] for each row of the file the row of the original.
-        median_position_error: in world units.
+        changes: by attribute in which splats look different.
     """
 
     largest: dict[str, float]
@@ -67,7 +82,7 @@ class Differences:
     worst_row: int
     wrong: dict[str, float]
     rows: Rows
-    median_position_error: float = 0.0
+    changes: dict[str, Change]
 
 
 def differences(splats: Splats, content: FileContent, *names: str) -> Differences:
@@ -93,7 +108,8 @@ def differences(splats: Splats, content: FileContent, *names: str) -> Difference
         sums[:] += [np.square(x).sum() for x in (pair[0] - pair[1], *pair)]
         return _errors(a, b)
 
-    return _summary(arrays_by_rows(len(file), errors_of, _BLOCK), sums, extent_of(splats), rows)
+    errors = arrays_by_rows(len(file), errors_of, _BLOCK)
+    return _summary(errors, sums, extent_of(splats), rows, _changes(errors, splats))
 
 
 def _orders(truth: Splats, file: Splats, names: tuple[str, ...]) -> Iterator[Rows]:
@@ -109,7 +125,9 @@ def _errors(a: Splats, b: Splats) -> dict[str, NDArray[np.floating]]:
     """By attribute, [N] the difference of each splat of the file, b, from the original, a."""
     thinnest = a.log_scales.astype(np.float64).max(axis=1, keepdims=True) + _THINNEST
     sizes = [np.maximum(s.log_scales, thinnest) for s in (a, b)]
+    linear = [np.exp(logs.astype(np.float64)) for logs in sizes]
     colours = [np.clip(0.5 + SH_C0 * s.sh[:, 0].astype(np.float64), 0, 1) for s in (a, b)]
+    change = np.square(a.sh[:, 1:].astype(np.float64) - b.sh[:, 1:]).sum(axis=1)
     return {
         "position": _largest_difference(a.means, b.means),
         "log_scale": _largest_difference(*sizes),
@@ -118,6 +136,33 @@ def _errors(a: Splats, b: Splats) -> dict[str, NDArray[np.floating]]:
         "sh": _largest_difference(*(s.sh.reshape(len(s), 3 * s.sh.shape[1]) for s in (a, b))),
         "colour": np.abs(colours[0] - colours[1]).max(axis=1, initial=0.0),
         "anisotropy": a.log_scales.max(axis=1) - a.log_scales.min(axis=1),
+        "own_size": linear[0].max(axis=1),
+        "size": _largest_difference(*linear),
+        # the basis functions are orthonormal on the sphere, whose area is 4 pi
+        "view_colour": np.sqrt(change.max(axis=1, initial=0.0) / (4 * np.pi)),
+    }
+
+
+def _changes(errors: dict[str, NDArray[np.floating]], splats: Splats) -> dict[str, Change]:
+    """Of the errors of `splats`, see `_errors`, those that are worth a warning."""
+    if not len(splats):
+        return {}
+    moved = errors["position"] > errors["own_size"]
+    resized = errors["log_scale"] > _RESIZED
+    if moved.any() or resized.any():
+        step = _STEP * median_spacing(splats.means)
+        moved &= errors["position"] > step
+        resized &= (errors["size"] > step) & ~moved  # some formats scale what they move
+    colour = np.maximum(errors["colour"], errors["view_colour"])
+    found = {
+        "position": (moved, errors["position"]),
+        "size": (resized, np.exp(errors["log_scale"])),
+        "colour": (colour > _RECOLOURED, colour),
+    }
+    return {
+        name: Change(int(np.count_nonzero(rows)), float(values[rows].max()))
+        for name, (rows, values) in found.items()
+        if rows.any()
     }
 
 
@@ -141,17 +186,20 @@ def rotation_angles(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray
 
 
 def _summary(
-    errors: dict[str, NDArray[np.floating]], sums: NDArray[np.float64], extent: float, rows: Rows
+    errors: dict[str, NDArray[np.floating]],
+    sums: NDArray[np.float64],
+    extent: float,
+    rows: Rows,
+    changes: dict[str, Change],
 ) -> Differences:
     if not len(rows):
-        return Differences(_named(dict.fromkeys(_VISIBLE, 0.0)), "", 0, {}, rows)
+        return Differences(_named(dict.fromkeys(_VISIBLE, 0.0)), "", 0, {}, rows, {})
     largest = {name: float(errors[name].max()) for name in _VISIBLE}
     units = {**_VISIBLE, "position": _VISIBLE["position"] * extent}
     worst = max(_VISIBLE, key=lambda name: largest[name] / units[name])
     shows = largest[worst] > _ROUNDING * units[worst]
     row = int(errors[worst].argmax()) if shows else 0
     typical = {name: float(np.median(errors[name])) for name in _WRONG if name != "sh"}
-    median_position_error = typical["position"]
     typical["position"] /= extent
     long = errors["anisotropy"] > _ANISOTROPIC
     typical["rotation"] = float(np.median(errors["rotation"][long])) if long.any() else 0.0
@@ -159,14 +207,7 @@ def _summary(
     wrong = {name: error for name, error in typical.items() if error > _WRONG[name]}
     if "position" in wrong:
         wrong = {"position": wrong["position"]}
-    return Differences(
-        _named(largest),
-        worst if shows else "",
-        row,
-        wrong,
-        rows,
-        median_position_error,
-    )
+    return Differences(_named(largest), worst if shows else "", row, wrong, rows, changes)
 
 
 def _named(largest: dict[str, float]) -> dict[str, float]:

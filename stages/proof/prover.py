@@ -8,7 +8,7 @@ because drawing takes more memory than the splats themselves.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +21,10 @@ from stages.base.text import reason_of
 from stages.evaluate.image_metrics import IDENTICAL_DB, capped_psnr_db
 from stages.formats import BY_ENDING, format_of
 from stages.formats.codecs import CODECS
-from stages.formats.losses import ENLARGE
+from stages.formats.compressed_ply import outlier_shells
 from stages.formats.values import check_finite, drop_undrawable, nonfinite_allowed
 from stages.proof import checks
-from stages.proof.compare import differences
+from stages.proof.compare import Change, differences
 from stages.proof.content import FileContent, NotCrossCheckedError
 from stages.proof.matching import Rows
 from stages.raster.backends import AUTO
@@ -38,6 +38,8 @@ _CENTRAL_SHARE = 0.5  # of the splats, to look at where no views are known
 _MAX_DRAWN = 1 << 22
 _MIN_LOSSLESS_DB = 45.0  # a file of a lossless format below this is wrong
 _WARN_LOSSY_DB = 30.0  # a file of a lossy format below this gets a warning
+_REPORT = "Write another format, and report this with the file that was read."
+DROP_OUTLIERS = "`splat edit --drop-floaters` removes outliers"
 _WRONG = {
     "position": "most positions are wrong, by {:.2g} of the scene's extent",
     "log_scale": "most sizes are wrong, by a factor of e^{:.2g}",
@@ -60,7 +62,7 @@ class Proof:
             where nothing could be compared.
         fault: why the file is wrong; "" if it is not.
         loss_db: the PSNR of a lossy file where it calls for a warning, else None.
-        median_position_error: in world units.
+        changes: by attribute in which splats look different.
         unchecked: what the independent reader does not understand, where the file is its own
             original; "" if it was compared.
     """
@@ -69,7 +71,7 @@ class Proof:
     figures: dict[str, Any]
     fault: str = ""
     loss_db: float | None = None
-    median_position_error: float = 0.0
+    changes: dict[str, Change] = field(default_factory=dict)
     unchecked: str = ""
 
 
@@ -124,13 +126,17 @@ class Prover:
         if proof.fault:
             raise QualityError(
                 code,
-                given=f"{path} came out wrong: {proof.fault}.",
+                given=f"{path.name} came out wrong: {proof.fault}.",
                 wanted="A file that another program reads as the same splats.",
-                hint=f"{ENLARGE}."
-                if CODECS[format_of(path).ending].size_loss(self.splats)
-                else "Write another format, and report this with the file that was read.",
+                hint=". ".join(filter(None, (self._advice(path), _REPORT))),
             )
         return proof
+
+    def _advice(self, path: Path) -> str:
+        """How the splats would fit the format of `path` better; "" if they fit."""
+        if advice := CODECS[format_of(path).ending].size_loss(self.splats)[1]:
+            return advice
+        return DROP_OUTLIERS if outlier_shells(self.splats.means).any() else ""
 
     def with_original(self, splats: Splats) -> Prover:
         """This prover for other values of the same splats. The pictures stay, so that all losses
@@ -185,13 +191,13 @@ class Prover:
             "worst_splat": found.worst_row,
         }
         fault = " and ".join(_WRONG[name].format(error) for name, error in found.wrong.items())
-        if "log_scale" in found.wrong and (loss := CODECS[names[0]].size_loss(self.splats)):
-            fault = f"{fault} (the format {loss})"
+        if "log_scale" in found.wrong and (why := CODECS[names[0]].size_loss(self.splats)[0]):
+            fault = f"{fault} (the format {why})"
         if not lossy and worst < _MIN_LOSSLESS_DB:
             drawn = f"drawn again it differs by {worst:.1f} dB"
             fault = f"{drawn}; {fault}" if fault else drawn
         loss_db = worst if lossy and worst < _WARN_LOSSY_DB and not fault else None
-        return Proof(len(content.splats), figures, fault, loss_db, found.median_position_error)
+        return Proof(len(content.splats), figures, fault, loss_db, found.changes)
 
     def _psnr_by_camera(self, content: FileContent, rows: Rows) -> list[float]:
         """PSNR by camera. rows: see `Differences`. The camera is moved into the axes of the file

@@ -134,7 +134,7 @@ def test_splats_out_of_range_are_counted_and_reported(tmp_path: Path) -> None:
     formats.write(tmp_path / "a.ply", splats)
     _, err = converted(tmp_path / "a.ply", tmp_path / "b.spz")
     assert err.count("Warning") == 1
-    assert "1 splat of 2,000" in " ".join(err.split())
+    assert "1 of 2,000 splats moved" in " ".join(err.split())
     out, _ = converted(tmp_path / "a.ply", tmp_path / "b.spz", "--json")
     assert "24 bits" in json.loads(out.splitlines()[-1])["warnings"][0]
 
@@ -142,12 +142,15 @@ def test_splats_out_of_range_are_counted_and_reported(tmp_path: Path) -> None:
 def test_outliers_that_coarsen_the_positions_of_a_sog_are_told(tmp_path: Path) -> None:
     splats = replace(many_splats(2000), origin=np.zeros(3))
     splats.sh[:, 1:] = 0
-    splats.means[4] = 1000 * np.ptp(splats.means, axis=0).max()
+    splats.means[:] *= 5e-4
+    splats.log_scales[:] -= 11
+    splats.means[4] = 1000
     formats.write(tmp_path / "a.ply", splats)
     _, err = converted(tmp_path / "a.ply", tmp_path / "b.sog")
     text = " ".join(err.split())
     assert err.count("Warning") == 1
-    assert "times as coarse as without 1 outlier" in text
+    assert "of 2,000 splats moved" in text
+    assert "16 bits in the range of all, and 1 outlier widened it" in text
     assert "--drop-floaters" in text
 
 
@@ -172,19 +175,20 @@ def test_a_loss_below_30_db_is_reported_with_its_cause(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("outlier", "cause"),
-    [(0.0, "too few bits for splats so close together"), (30.0, "1 outlier widened the range")],
+    [(0.0, "in the range of each 256."), (30.0, "in the range of each 256, and 1 outlier")],
 )
-def test_positions_off_by_more_than_neighbours_are_reported_with_their_cause(
+def test_positions_off_by_more_than_neighbours_and_sizes_are_reported_with_their_cause(
     tmp_path: Path, outlier: float, cause: str
 ) -> None:
     splats = replace(many_splats(200), origin=np.zeros(3))
     splats.means[:] = np.random.default_rng(0).normal(0, 1e-4, splats.means.shape)
     splats.means[100:] += 1
     splats.means[7] += outlier
+    splats.log_scales[:] = -12
     formats.write(tmp_path / "a.ply", splats)
     _, err = converted(tmp_path / "a.ply", tmp_path / "b.compressed.ply")
     text = " ".join(err.split())
-    assert "half of the splats are off by" in text
+    assert "of 200 splats moved, by up to" in text
     assert cause in text
     assert err.count("Warning") == 1
 

@@ -86,6 +86,22 @@ def test_merged_files_meet_in_the_coordinates_of_their_capture(tmp_path: Path) -
     np.testing.assert_allclose(found.means[9:] - found.means[:9], [[3, 0, 0]] * 9, atol=1e-5)
 
 
+def test_files_too_far_apart_for_32_bits_are_not_merged(tmp_path: Path) -> None:
+    splats = replace(many_splats(100), origin=np.zeros(3))
+    formats.write(tmp_path / "near.ply", splats)
+    formats.write(tmp_path / "far.ply", replace(splats, origin=np.array([4e6 + 0.3, 0, 0])))
+    words = (tmp_path / "near.ply", tmp_path / "b.ply")
+    _, err = edited(*words, "--merge", tmp_path / "far.ply", code=2)
+    assert "edit-merge-far" in err
+    assert "4,000,000 units apart" in err
+    assert not (tmp_path / "b.ply").exists()
+    edited(*words, "--move", "4000000,0,0", "--merge", tmp_path / "far.ply")
+    found = result_of(tmp_path / "b.ply")
+    np.testing.assert_allclose(
+        found.means[100:] - found.means[:100], [[0.3, 0, 0]] * 100, atol=1e-5
+    )
+
+
 def test_metres_stay_metres_until_the_scene_is_scaled(source: Path, tmp_path: Path) -> None:
     edited(source, tmp_path / "b.glb", "--move", "1,2,3", "--rotate", "x:20")
     assert formats.units_of(tmp_path / "b.glb") == "metres"
@@ -210,7 +226,8 @@ def test_what_the_new_file_cannot_hold_is_reported(source: Path, tmp_path: Path)
     _, err = edited(source, tmp_path / "b.spz", "--quiet")
     assert "b.spz.offset.json" in err
     out, _ = edited(source, tmp_path / "b.splat", "--json")
-    drawing, origin = json.loads(out.splitlines()[-1])["warnings"]
+    lossy, drawing, origin = json.loads(out.splitlines()[-1])["warnings"]
+    assert "do not change with the view" in lossy
     assert "antialiased drawing" in drawing
     assert "b.splat.offset.json" in origin
     out, _ = edited(source, tmp_path / "b.glb", "--scale", "1e9", "--scale", "1e9", "--json")

@@ -188,7 +188,7 @@ def test_a_visible_loss_is_a_warning_and_no_failure(scene: SmallScene, tmp_path:
     formats.write(tmp_path / "a.ply", gaudy)
     formats.write(tmp_path / "a.splat", gaudy)
     _, err = verified(tmp_path / "a.splat", "--against", tmp_path / "a.ply")
-    assert "Warning: a.splat shows" in err
+    assert "Warning: Pictures of a.splat" in err
     assert "do not change with the view" in err
 
 

@@ -138,8 +138,8 @@ def test_a_bad_8_bit_copy_is_a_warning(scene: SmallScene, tmp_path: Path) -> Non
     gaudy = replace(scene.splats, sh=sh)
     _, report = exported(scene, tmp_path, gaudy, formats=("splat", "ply"))
     assert [code for code, _ in report.warnings] == [
-        "export-splat-origin",
         "export-splat-lossy",
+        "export-splat-origin",
     ]
 
 

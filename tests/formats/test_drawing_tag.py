@@ -12,8 +12,8 @@ import pytest
 from stages import formats
 from stages.base.errors import SplatError
 from stages.formats.format_table import ANTIALIASED, AUTO, FORMATS, PLAIN
-from stages.formats.losses import losses_of
-from stages.proof.prover import Prover, cameras_for
+from stages.proof.losses import losses_of
+from stages.proof.prover import Proof, Prover, cameras_for
 from tests.scenes import cloud
 
 SAYING = [
@@ -127,7 +127,7 @@ def test_the_choice_of_drawing_overrules_the_format() -> None:
 
 
 def test_antialiased_splats_in_a_format_for_plain_viewers_are_a_loss() -> None:
-    codes = [*losses_of(FORMATS["ply"], "scene.ply", scene(True))]
-    assert codes == ["drawing"]
-    assert not losses_of(FORMATS["ply"], "scene.ply", scene(False))
-    assert not losses_of(FORMATS["html"], "scene.html", scene(True))
+    proof = Proof(3, {})
+    assert [*losses_of(Path("scene.ply"), scene(True), proof)] == ["drawing"]
+    assert not losses_of(Path("scene.ply"), scene(False), proof)
+    assert not losses_of(Path("scene.html"), scene(True), proof)
