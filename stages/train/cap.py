@@ -19,6 +19,7 @@ from stages.scene import Camera, parameters_per_splat
 from stages.train.optimiser import Model
 
 FILE_NAME = "cap.json"
+FREE_MEMORY = "free memory"
 DEVICE_MEMORY = "the GPU's memory"
 PHOTOGRAPHS = "the photographs' pixels"
 BYTES_PER_SPLAT = 1600  # parameters, moments, gradients, footprint and about 6 intersections
@@ -32,7 +33,7 @@ class Cap:
 
     Args:
         splats: the largest number allowed.
-        origin: "--max-splats", "free memory", PHOTOGRAPHS or DEVICE_MEMORY.
+        origin: "--max-splats", FREE_MEMORY, PHOTOGRAPHS or DEVICE_MEMORY.
         free_mib: memory that was free, if that decided.
     """
 
@@ -46,9 +47,14 @@ def splat_cap(free_mib: float) -> int:
     return max(MIN_CAP, int(0.5 * free_mib * 1024 * 1024 / BYTES_PER_SPLAT))
 
 
+def memory_mib(splats: int) -> float:
+    """Memory that `splats` splats take in training."""
+    return splats * BYTES_PER_SPLAT / (1024 * 1024)
+
+
 def needed_mib(splats: int) -> float:
     """Memory of one run, all its stages, that trains at most `splats` splats."""
-    return BASE_MIB + splats * BYTES_PER_SPLAT / (1024 * 1024)
+    return BASE_MIB + memory_mib(splats)
 
 
 def cap_for(folder: Path, max_splats: int, determined: int) -> Cap:
@@ -67,7 +73,7 @@ def cap_for(folder: Path, max_splats: int, determined: int) -> Cap:
     if max_splats:
         return Cap(max_splats, "--max-splats")
     free_mib = available_mib()
-    by_memory = Cap(splat_cap(free_mib), "free memory", round(free_mib))
+    by_memory = Cap(splat_cap(free_mib), FREE_MEMORY, round(free_mib))
     cap = min(by_memory, Cap(determined, PHOTOGRAPHS), key=lambda cap: cap.splats)
     return _saved(cap, folder)
 

@@ -28,7 +28,14 @@ from stages.raster.smoothing import smoothed
 from stages.scene import Reconstruction, RefinedCameras, Splats, TrainedSplats
 from stages.scene.storage import load_splats, save_splats
 from stages.train.build import make_trainer
-from stages.train.cap import DEVICE_MEMORY, PHOTOGRAPHS, Cap, lower_cap, remove_cap
+from stages.train.cap import (
+    DEVICE_MEMORY,
+    FREE_MEMORY,
+    Cap,
+    lower_cap,
+    memory_mib,
+    remove_cap,
+)
 from stages.train.checkpoint import remove_checkpoint
 from stages.train.conversion import splats_of
 from stages.train.loop import train
@@ -37,6 +44,7 @@ from stages.train.settings import TrainSettings
 from stages.train.trainer import Trainer
 
 _TRAINED = "training.json"
+_AT_THE_CAP = 0.98  # of it: the last round of densification seldom fills it
 
 
 def run(
@@ -79,7 +87,7 @@ def run(
     remove_cap(folder)
     report.metric("splats", len(splats))
     _report_course(trainer, report)
-    _report_cap(trainer.cap, trainer.history.most_splats, len(splats), report)
+    _report_cap(trainer.cap, trainer.history.most_splats, report)
     report.metric("train_seconds", round(time.monotonic() - started, 1))
     return trained
 
@@ -107,9 +115,9 @@ def _report_course(trainer: Trainer, report: Report) -> None:
         )
 
 
-def _report_cap(cap: Cap, densified: int, kept: int, report: Report) -> None:
-    """Whether the cap of splats was lowered or reached. densified: the largest number of splats in
-    the run; kept: their number at its end."""
+def _report_cap(cap: Cap, densified: int, report: Report) -> None:
+    """The cap of splats; a warning where memory lowered it, not where the user or a preset chose
+    it. densified: the largest number of splats in the run."""
     report.metric("splat_cap", cap.splats)
     report.metric("splat_cap_from", cap.origin)
     report.metric("densified_splats", densified)
@@ -118,19 +126,12 @@ def _report_cap(cap: Cap, densified: int, kept: int, report: Report) -> None:
             "train-gpu-memory",
             f"The GPU's memory was full: trained with at most {cap.splats:,} splats.",
         )
-    if densified < 0.98 * cap.splats:
-        return
-    more = "more memory, or a higher --max-splats, may add detail"
-    if cap.origin == PHOTOGRAPHS:
-        more = (
-            "they have as many parameters as the photographs have pixel values; more or larger "
-            "photographs may add detail"
+    if cap.origin == FREE_MEMORY and densified >= _AT_THE_CAP * cap.splats:
+        report.warn(
+            "train-splat-cap-reached",
+            f"Free memory ({cap.free_mib or 0:,.0f} MiB) limited training to {cap.splats:,} "
+            f"splats; 100,000 more take {memory_mib(100_000):,.0f} MiB.",
         )
-    report.warn(
-        "train-splat-cap-reached",
-        f"Densification stopped at the cap of {cap.splats:,} splats, of which the photographs "
-        f"need {kept:,}; {more}.",
-    )
 
 
 def _does_not_fit(full: MemoryFull, cap: int) -> SplatError:

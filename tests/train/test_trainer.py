@@ -398,17 +398,20 @@ def test_a_run_goes_on_under_its_first_cap_whatever_memory_is_free_by_then(
 
         report.listener = stop
         train.run(inputs, settings, folder, report)
-        return (folder / "splats.bin").read_bytes(), report.metrics
+        return (folder / "splats.bin").read_bytes(), report.metrics, dict(report.warnings)
 
-    few, figures = trained("few", 100.0)
-    many, _ = trained("many", 400.0)
+    few, figures, warnings = trained("few", 100.0)
+    many, *_ = trained("many", 400.0)
     assert few != many
     assert (figures["splat_cap"], figures["splat_cap_from"]) == (100, "free memory")
     assert figures["splat_cap_free_mib"] == 100
+    assert warnings["train-splat-cap-reached"] == (
+        "Free memory (100 MiB) limited training to 100 splats; 100,000 more take 153 MiB."
+    )
     with pytest.raises((KilledError, Interrupted)):
         trained("broken", 100.0, stopping=True)
     assert (tmp_path / "broken" / "checkpoint.bin").exists() == ("stopped" in how)
-    again, _ = trained("broken", 400.0)
+    again, *_ = trained("broken", 400.0)
     assert again == few
     assert not (tmp_path / "broken" / "cap.json").exists()
 
@@ -448,9 +451,17 @@ def test_a_run_that_another_backend_goes_on_with_says_so(tmp_path):
     assert "train-several-backends" not in dict(trained("cpu").warnings)
 
 
-def test_a_cap_that_the_user_set_is_reported_as_such(tmp_path):
+def test_a_cap_that_the_user_or_a_preset_set_is_reported_without_a_warning(tmp_path):
+    scene = small_scene(tmp_path)
+    inputs = {"sfm": scene.reconstruction, "seed": scene.splats.with_sh_degree(0)}
+    settings = TrainSettings(steps=30, train_side=48, sh_degree=0, max_splats=100)
+    report = Report()
+    (tmp_path / "out").mkdir()
+    train.run(inputs, settings, tmp_path / "out", report)
+    assert report.metrics["densified_splats"] == report.metrics["splat_cap"] == 100
+    assert "train-splat-cap-reached" not in dict(report.warnings)
     assert cap.cap_for(tmp_path, 500, 100) == cap.Cap(500, "--max-splats")
-    assert not list(tmp_path.iterdir())
+    assert not (tmp_path / cap.FILE_NAME).exists()
 
 
 def test_splats_have_no_more_parameters_than_the_views_have_values(tmp_path, monkeypatch):
