@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -18,13 +19,20 @@ from splatcli.folders import load_target
 from splatcli.options import number
 from stages.base import interrupt, scratch
 from stages.base.errors import SplatError, UsageError
-from stages.formats import format_of, ply
+from stages.formats import format_of, html, ply
 from stages.formats.values import drop_undrawable
 from stages.run import results
 from stages.run.pipeline import Pipeline
 from stages.scene import Splats
+from stages.viewer.render_cameras import camera_of_view
 from stages.viewer.server import Item, LocalServer, open_in_browser
 from stages.viewer.site import site
+
+
+def _of_page(help: str, shown: str | bool = True, metavar: str | None = None) -> Any:
+    """An option of the page for a client."""
+    panel = "A page for a client"
+    return typer.Option(help=help, show_default=shown, metavar=metavar, rich_help_panel=panel)
 
 
 def view(
@@ -36,23 +44,32 @@ def view(
     open_browser: Annotated[
         bool, typer.Option("--open/--no-open", help="Open the browser, or only print the address.")
     ] = True,
+    save: Annotated[
+        Path | None,
+        _of_page(
+            "Write a page for a client (.html), in place of showing one: no panel, no file names; "
+            "it opens from disk."
+        ),
+    ] = None,
+    camera: Annotated[
+        str | None, _of_page("The first view: a photograph's name or number.", "the first")
+    ] = None,
+    title: Annotated[str | None, _of_page("The page's title.", "the file's name")] = None,
+    background: Annotated[
+        str, _of_page("The colour behind the splats.", metavar="#RRGGBB")
+    ] = "#000000",
 ) -> None:
     """Show the splats in a browser: orbit, fly, stand where the photographs were taken.
 
     The page is served to this machine only and needs no network. Ctrl-C ends it.
     """
+    if save is not None:
+        _save(target, save, camera, title, background)
+        return
     with one_signal_stops(), tempfile.TemporaryDirectory(prefix="splat-view-") as folder:
         with scratch.scratch_in(Path(folder), spare=True):
-            splats, pipeline = load_target(target)
-            splats, _ = drop_undrawable(splats)
+            splats, pipeline = _loaded(target)
             count = len(splats)
-            if not count:
-                raise SplatError(
-                    "view-empty",
-                    given=f"{_title(target, pipeline)} holds no splat that can be drawn.",
-                    wanted="At least one.",
-                    hint="See what it holds with `splat info`.",
-                )
             items = _items(target, pipeline, splats, Path(folder) / "scene.ply")
         del splats  # frees the memory: the page holds what it needs
         try:
@@ -66,6 +83,38 @@ def view(
             ) from error
         with server:
             _serve(server, count, open_browser)
+
+
+def _loaded(target: Path | None) -> tuple[Splats, Pipeline | None]:
+    """As `load_target`, without what cannot be drawn. Raises SplatError."""
+    splats, pipeline = load_target(target)
+    splats, _ = drop_undrawable(splats)
+    if not len(splats):
+        raise SplatError(
+            "view-empty",
+            given=f"{_title(target, pipeline)} holds no splat that can be drawn.",
+            wanted="At least one.",
+            hint="See what it holds with `splat info`.",
+        )
+    return splats, pipeline
+
+
+def _save(
+    target: Path | None, path: Path, camera: str | None, title: str | None, background: str
+) -> None:
+    """Write the page for a client."""
+    if path.suffix.lower() != ".html" or not re.fullmatch("#[0-9a-fA-F]{6}", background):
+        raise UsageError(
+            "view-page",
+            given=f"--save {path} --background {background}.",
+            wanted="A name that ends in .html, and a colour such as #ffffff.",
+            hint="splat view --save client.html --background '#ffffff'",
+        )
+    splats, pipeline = _loaded(target)
+    first = camera_of_view(splats, results.views_of(pipeline or results.run_around(target)), camera)
+    page = html.ClientPage(first, path.stem if title is None else title, background)
+    html.write(path, splats, client=page)
+    console.note(f"{path}: {len(splats):,} splats, {console.size(path.stat().st_size)}.")
 
 
 def _items(

@@ -12,6 +12,7 @@ import re
 import tempfile
 import zlib
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 from stages.base.atomic import replacing
@@ -19,8 +20,8 @@ from stages.base.bad_files import BadFileError
 from stages.formats import ply
 from stages.formats.inflate import check_size
 from stages.page import document
-from stages.page.cameras import page_cameras
-from stages.scene import Splats, View
+from stages.page.cameras import PageCamera, page_cameras
+from stages.scene import Camera, Splats, View
 
 _GZIP = 31  # wbits of zlib for the gzip container, whose header then holds no time
 _LEVEL = 6
@@ -30,15 +31,40 @@ _END_BYTES = 1 << 10
 _INFLATED_AT_ONCE = 1 << 22
 
 
+@dataclass(frozen=True)
+class ClientPage:
+    """A page to send to a client: without a panel and without names of files.
+
+    camera: the first view. title: of the page. background: "#rrggbb", behind the splats.
+    """
+
+    camera: Camera
+    title: str
+    background: str = "#000000"
+
+
 def write(
-    path: Path, splats: Splats, *, units: str = "arbitrary", views: tuple[View, ...] = ()
+    path: Path,
+    splats: Splats,
+    *,
+    units: str = "arbitrary",
+    views: tuple[View, ...] = (),
+    client: ClientPage | None = None,
 ) -> None:
     """Write `splats`.
 
-    views: cameras to look from. Raises SplatError when the file cannot be written.
+    Args:
+        views: cameras to look from.
+        client: makes a page for a client, with its own camera alone.
+
+    Raises SplatError when the file cannot be written.
     """
-    shots = page_cameras(views, splats)
-    scene = document.scene_data(path.stem, splats, shots, units=units, source=path.name)
+    title, source, shots = path.stem, path.name, page_cameras(views, splats)
+    if client is not None:
+        title, source, shots = client.title, "", (PageCamera(client.title, client.camera),)
+    scene = document.scene_data(title, splats, shots, units=units, source=source)
+    if client is not None:
+        scene |= {"client": True, "background": client.background}
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(document.head(scene).encode("utf-8"))
         for chunk in _chunks(_zipped(ply.file_blocks(splats, units))):

@@ -20,7 +20,7 @@ from stages.scene import Splats
 CHUNK_START = '<script type="text/plain" class="splats">'
 CHUNK_END = "</script>\n"
 PAGE_END = "</body>\n</html>\n"
-_SCRIPTS = ("lens.js", "levels.js", "content.js", "panel.js", "select.js", "main.js")
+_SCRIPTS = ("lens.js", "levels.js", "content.js", "panel.js", "access.js", "select.js", "main.js")
 _LIVE_SCRIPTS = ("orbit.js", "panel.js", "live.js")
 _MIDDLE_PERCENT, _WIDER = (1, 99), 0.1
 _POLICY = (
@@ -98,7 +98,7 @@ def _head(scene: dict[str, Any], style: str) -> str:
         '<link rel="icon" href="data:,">\n'
         f"<title>{html.escape(scene['title'])}</title>\n"
         f"<style>\n{style}\n{_asset('parts', 'page.css')}</style>\n</head>\n<body>\n"
-        f"{_asset('parts', 'body.html')}"
+        f"{_asset('parts', 'body.html')}<script>\n{_asset('parts', 'failure.js')}</script>\n"
         f'<script type="application/json" id="scene">{data}</script>\n'
     )
 

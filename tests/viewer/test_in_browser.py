@@ -79,6 +79,7 @@ def test_a_file_of_its_own_draws_the_same_from_disk(browser: Browser, tmp_path: 
 def test_the_photograph_is_shown_beside_until_the_camera_moves(
     browser: Browser, address: str
 ) -> None:
+    browser.resize((900, 700))
     browser.open(address + "?webgl")
     assert browser.run("window.splatReady")["name"] == "day 1/<0>.png"
     assert "10 splats" in browser.run("document.getElementById('figures').textContent")
@@ -93,8 +94,8 @@ def test_the_photograph_is_shown_beside_until_the_camera_moves(
     assert browser.run(caption) == "day 1/<0>.png: training never saw it"
     browser.run("document.getElementById('next').click()")
     assert browser.run(caption) == "day 1/<1>.png: used in training"
-    for kind, x in (("mousePressed", 90), ("mouseMoved", 120), ("mouseReleased", 120)):
-        browser.call("Input.dispatchMouseEvent", type=kind, x=x, y=180, button="left", clickCount=1)
+    for kind, x in (("mousePressed", 200), ("mouseMoved", 230), ("mouseReleased", 230)):
+        browser.call("Input.dispatchMouseEvent", type=kind, x=x, y=380, button="left", clickCount=1)
     note = "document.getElementById('note').textContent"
     assert "Moved" in browser.run(note)
     browser.run("document.getElementById('back').click()")

@@ -95,7 +95,7 @@ def bare(browser: Browser, address: str) -> None:
     browser.open(address)
     browser.run(
         "{ const style = document.createElement('style');"
-        "style.textContent = '#panel, #message { visibility: hidden }';"
+        "style.textContent = '#panel, #message { display: none !important }';"
         "document.head.append(style); }"
     )
 
@@ -122,6 +122,18 @@ def seen_at(matrix: np.ndarray, camera: Camera, point: np.ndarray) -> np.ndarray
     """[2] pixels."""
     x, y, z = matrix[:3, :3] @ point + matrix[:3, 3]
     return np.array([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
+
+
+def test_its_keys_are_those_of_the_finished_page(browser: Browser, worker: Any) -> None:
+    bare(browser, worker.address)
+    number = "document.getElementById('shot').selectedIndex"
+    assert browser.run(number) == 0
+    for key, expected in ((".", 1), (".", 2), (",", 1), ("ArrowRight", 1), ("b", 1)):
+        browser.run(
+            f"document.body.dispatchEvent(new KeyboardEvent('keydown', {{key: {key!r},"
+            " bubbles: true}))"
+        )
+        assert browser.run(number) == expected, key
 
 
 def test_the_page_shows_what_is_trained_from_every_camera(browser: Browser, worker: Any) -> None:

@@ -180,7 +180,7 @@ def test_the_page_fetches_nothing_from_elsewhere_and_names_cannot_break_out() ->
     text = page.items["/"].content.decode()  # type: ignore[union-attr]
     elements = Elements(text)
     assert elements.scene()["shots"][0]["name"] == HOSTILE
-    assert sum(tag == "script" for tag, _ in elements.tags) == 2
+    assert sum(tag == "script" for tag, _ in elements.tags) == 3
     assert not re.search(r"https?://", text)
     (policy,) = re.findall(r'http-equiv="Content-Security-Policy" content="([^"]*)"', text)
     assert "default-src 'none'" in policy

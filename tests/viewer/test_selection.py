@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import shlex
 from pathlib import Path
 
@@ -59,7 +60,7 @@ def in_order(means: np.ndarray) -> np.ndarray:
 def edited(browser: Browser, page: Path) -> np.ndarray:
     """[N, 3] centres that what the page wrote leaves."""
     words = shlex.split(browser.run(CHAIN))
-    assert words[:4] == ["splat", "edit", page.name, "OUT"]
+    assert words[:4] == ["splat", "edit", page.name, "edited.ply"]
     out = page.with_name("out.ply")
     result = CliRunner().invoke(app, ["edit", str(page), str(out), *words[4:]])
     assert result.exit_code == 0, result.stderr
@@ -105,9 +106,57 @@ def test_undo_removes_the_last_of_several_selections(browser: Browser, tmp_path:
     assert len(edited(browser, page)) == 2000 - len(lassoed)
 
 
+@pytest.mark.slow
+def test_what_is_left_out_is_hidden_at_once_undone_and_saved_as_on_the_command_line(
+    browser: Browser, tmp_path: Path
+) -> None:
+    page = opened(browser, tmp_path)
+    assert all(disabled(browser, name) for name in ("keep", "drop", "undo", "save", "copy"))
+    before = settled(browser)
+    lasso(browser, [(420, 200), (650, 220), (700, 500), (560, 560), (430, 520)])
+    inside = (slice(300, 450), slice(480, 600))
+    browser.run("document.getElementById('drop').click()")
+    after = settled(browser)
+    assert before[inside].mean() > 2 * after[inside].mean()
+    outside = (slice(600, 690), slice(100, 300))
+    np.testing.assert_allclose(after[outside], before[outside], atol=1 / 255)
+    browser.run(
+        "window.saved = new Promise(done => { URL.createObjectURL = blob => {"
+        "const reader = new FileReader(); reader.onload = () => done(reader.result.split(',')[1]);"
+        "reader.readAsDataURL(blob); return '#'; }; }); document.getElementById('save').click()"
+    )
+    saved = tmp_path / "saved.ply"
+    saved.write_bytes(base64.b64decode(browser.run("window.saved")))
+    np.testing.assert_array_equal(in_order(formats.read(saved).means), edited(browser, page))
+    browser.run("document.getElementById('undo').click()")
+    np.testing.assert_allclose(settled(browser), before, atol=1 / 255)
+    assert disabled(browser, "save")
+
+
+def disabled(browser: Browser, name: str) -> bool:
+    return bool(browser.run(f"document.getElementById({name!r}).disabled"))
+
+
+def settled(browser: Browser) -> np.ndarray:
+    """The picture of the scene when nothing changes any more, without the panel."""
+    browser.run("document.getElementById('panel').style.visibility = 'hidden'")
+    browser.run("new Promise(done => setTimeout(done, 700))")
+    picture = browser.picture()
+    browser.run("document.getElementById('panel').style.visibility = ''")
+    return picture
+
+
+def test_the_command_is_for_the_shell_of_the_system(browser: Browser, tmp_path: Path) -> None:
+    system = "Object.defineProperty(navigator, 'platform', { value: 'Win32' })"
+    added = browser.call("Page.addScriptToEvaluateOnNewDocument", source=system)
+    opened(browser, tmp_path)
+    browser.call("Page.removeScriptToEvaluateOnNewDocument", identifier=added["identifier"])
+    assert browser.run(CHAIN) == 'splat edit "it\'s a page.html" edited.ply'
+
+
 def test_looking_around_selects_nothing(browser: Browser, tmp_path: Path) -> None:
     page = opened(browser, tmp_path)
-    assert shlex.split(browser.run(CHAIN)) == ["splat", "edit", page.name, "OUT"]
+    assert shlex.split(browser.run(CHAIN)) == ["splat", "edit", page.name, "edited.ply"]
     assert "2,000 left" in browser.run("document.getElementById('chosen').textContent")
     assert browser.run("document.getElementById('keep').disabled")
     browser.resize(SIZE)

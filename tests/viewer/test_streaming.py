@@ -109,7 +109,7 @@ def test_a_partly_loaded_streamed_asset_can_be_selected_from(
     browser.run("splatSelection.corners = [[0, 0], [9, 0], [9, 9]]; splatSelection.end()")
     browser.run("document.getElementById('keep').click()")
     chain = browser.run("document.getElementById('chain').value")
-    assert chain.startswith(f"splat edit {asset} OUT --crop lasso:")
+    assert chain.startswith(f'splat edit {asset} edited.ply --crop "lasso:')
     assert browser.run("document.getElementById('chosen').textContent") == ""
 
 

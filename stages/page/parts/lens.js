@@ -36,8 +36,7 @@ class Lens {
         canvas.addEventListener("pointerdown", release, { capture: true });
         canvas.addEventListener("wheel", release, { capture: true, passive: true });
         window.addEventListener("keydown", (event) => {
-            const typing = event.target.closest && event.target.closest("#panel");
-            if (!typing && /^([wasdqe]|arrow\w+|[1-3]|[fr])$/i.test(event.key)) release();
+            if (/^([wasdqe]|arrow\w+|[1-3]|[fr])$/i.test(event.key)) release();
         });
         // After the viewer's own handler, which was there first, has placed its camera.
         app.on("update", () => this.place());

@@ -144,14 +144,12 @@ function listen() {
         moved();
     }, { passive: false });
     window.addEventListener("keydown", (event) => {
-        if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest("#panel")) return;
+        if (event.ctrlKey || event.metaKey || event.altKey) return;
         const way = MOVES[event.key.toLowerCase()];
         if (way) {
             orbit.shift(...way.map((part) => part * STEP));
             moved();
-        } else if (event.key === "ArrowLeft") panel.step(-1);
-        else if (event.key === "ArrowRight") panel.step(1);
-        else if (event.key === "p") panel.box.click();
+        }
     });
     document.addEventListener("visibilitychange", () => wake());
     window.addEventListener("resize", changed);
@@ -164,10 +162,10 @@ const panel = new Live(scene, (shot) => {
     changed();
     panel.shown(shot);
 });
-const help = find("panel").appendChild(document.createElement("small"));
-help.textContent = "Drag turns, right drag moves, the wheel comes closer, W A S D Q E fly; "
-    + "\u2190 \u2192 other cameras, P the photograph.";
+find("keys").textContent =
+    `Drag turns, right drag moves, the wheel comes closer, W A S D Q E fly. ${find("keys").textContent}`;
 panel.step(Math.max(0, scene.shots.findIndex((shot) => shot.held_out)));
 listen();
 follow();
 pictures();
+window.splatReady = window.splatStarted = true;

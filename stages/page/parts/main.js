@@ -1,9 +1,12 @@
-// Address options: ?camera=NAME starts there, ?bare leaves all controls away, ?webgl asks for it.
+// Address options: ?camera=NAME starts there, ?bare leaves all controls away, ?webgl asks for it. The
+// page for a client (scene.client) has the viewer's controls and no panel.
 // For scripts: `splatReady` is a promise that resolves when the first camera is drawn, and
 // `splatShow(name)` one that resolves when the camera of that name is; `splatSelection` what is
 // selected.
 // Sorting runs beside drawing and takes a few frames to be seen; every ten, the streamed levels are chosen again.
 const STEADY_FRAMES = 12;
+
+const rgbOf = (hex) => [1, 3, 5].map((at) => parseInt(hex.slice(at, at + 2), 16) / 255);
 
 function settingsFor(scene) {
     const pose = (shot) => {
@@ -16,7 +19,7 @@ function settingsFor(scene) {
         version: 2,
         tonemapping: "none",
         highPrecisionRendering: false,
-        background: { color: [0, 0, 0] },
+        background: { color: rgbOf(scene.background || "#000000") },
         postEffectSettings: {
             sharpness: { ...off, amount: 0 },
             bloom: { ...off, intensity: 1, blurLevel: 2 },
@@ -59,21 +62,36 @@ function loaded(viewer) {
         if (viewer.state.loaded) resolve();
         viewer.events.once("loaded:changed", resolve);
         viewer.app.assets.on("error", (error) => reject(new Error(String(error))));
+        addEventListener("unhandledrejection", ({ reason }) => reject(reason)); // a download that ended
     });
+}
+
+async function checkGraphics() {
+    const canvas = document.createElement("canvas");
+    if (canvas.getContext("webgl2")) return;
+    if (navigator.gpu && (await navigator.gpu.requestAdapter())) return;
+    throw new Error(
+        "this browser has neither WebGL 2 nor WebGPU, or they are switched off. Switch on hardware "
+        + "acceleration in its settings, or take another browser."
+    );
 }
 
 async function start() {
     const scene = JSON.parse(find("scene").textContent);
     const query = new URLSearchParams(location.search);
     const bare = query.has("bare");
+    const withPanel = !bare && !scene.client;
     const streamed = scene.levels.length > 0; // then the viewer fetches what it wants of it
-    if (scene.count === 0) throw new Error("There is not one splat to show.");
+    if (scene.count === 0) throw new Error("there is not one splat to show.");
+    await checkGraphics();
+    const source = streamed ? null : await sourceOf(scene);
+    const meta = streamed ? await (await fetched(scene.content)).json() : null;
     const viewer = await SuperSplatViewer.createViewer({
         container: find("view"),
         settings: settingsFor(scene),
         contentUrl: scene.content || "scene.ply",
         contentFilename: streamed ? "lod-meta.json" : "scene.ply",
-        contents: streamed ? undefined : contentOf(scene),
+        contents: streamed ? undefined : await source(),
         renderer: query.has("webgl") ? "webgl" : "webgpu",
         ui: !bare,
         aa: scene.antialias,
@@ -86,15 +104,17 @@ async function start() {
     const lens = new Lens(app, app.graphicsDevice.canvas, () => panel && panel.moved());
     viewer.events.on("cameraMode:changed", () => lens.release()); // by a button or a key
     // After the lens has placed the camera.
-    if (streamed) window.splatLevels = new Levels(app, await (await fetch(scene.content)).json(), scene.levels);
+    if (streamed) window.splatLevels = new Levels(app, meta, scene.levels);
     const show = (shot) => {
         viewer.selectAnnotation(scene.shots.indexOf(shot)); // where orbiting goes on from
         lens.hold(shot);
         if (panel) panel.shown(shot);
         return steady(app);
     };
-    if (!bare) panel = new Panel(scene, show);
-    if (!bare) window.splatSelection = new Selection(scene, app);
+    if (withPanel) panel = new Panel(scene, show);
+    else shareKeys();
+    if (withPanel) window.splatSelection = new Selection(scene, app, source);
+    if (!bare) makeAccessible(scene, app.graphicsDevice.canvas);
     app.on("prerender", () => panel && panel.frames++);
     const named = (name) => scene.shots.find((shot) => shot.name === name);
     window.splatShow = async (name) => {
@@ -102,6 +122,7 @@ async function start() {
         await show(named(name));
         return { name, splats: app.stats.frame.gsplats, renderer: app.graphicsDevice.deviceType };
     };
+    window.splatStarted = true;
     find("message").hidden = true;
     const heldOut = scene.shots.find((shot) => shot.held_out);
     const first = named(query.get("camera")) || heldOut || scene.shots[0];
@@ -109,6 +130,4 @@ async function start() {
 }
 
 window.splatReady = start();
-window.splatReady.catch((error) => {
-    find("message").textContent = `The splats cannot be shown: ${error.message}`;
-});
+window.splatReady.catch((error) => window.splatFailed(error.message));

@@ -1,5 +1,19 @@
 // Figures, the list of cameras, and the photograph beside the picture.
 const find = (id) => document.getElementById(id);
+const SMALL = "(pointer: coarse), (max-width: 700px)"; // as in page.css: a phone
+
+// What has the keys: a list takes all but Escape, a button those that press it.
+function takesKey(element, key) {
+    if (element.matches("select, input, textarea")) return key !== "Escape";
+    return element.matches("button, summary, [role=button]") && (key === " " || key === "Enter");
+}
+
+function shareKeys() {
+    document.addEventListener("keydown", (event) => {
+        if (takesKey(event.target, event.key)) event.stopPropagation(); // the viewer listens on the window
+        else if (event.key === "Escape") document.activeElement.blur();
+    });
+}
 
 class Panel {
     constructor(scene, show) {
@@ -19,14 +33,39 @@ class Panel {
         this.box.onchange = () => this.step(0);
         find("previous").hidden = find("next").hidden = scene.shots.length < 2;
         find("compare").hidden = !scene.shots.some((shot) => shot.photo);
-        // A list or button that keeps the focus would take the keys that fly.
-        find("panel").addEventListener("change", () => document.activeElement.blur());
-        for (const button of find("panel").querySelectorAll("button")) {
-            button.addEventListener("click", () => button.blur());
+        this.fold(matchMedia(SMALL).matches);
+        find("fold").onclick = () => this.fold(!find("controls").hidden);
+        // What keeps the focus after a click would take the keys that fly; a keyboard's focus stays.
+        for (const kind of ["change", "click"]) {
+            find("panel").addEventListener(kind, () => {
+                if (!document.activeElement.matches(":focus-visible")) document.activeElement.blur();
+            });
         }
+        this.listen();
         setInterval(() => this.tick(), 1000);
         this.tick();
         find("panel").hidden = false;
+    }
+
+    fold(away) {
+        find("controls").hidden = away;
+        find("fold").setAttribute("aria-expanded", String(!away));
+    }
+
+    // The same keys on every page.
+    listen() {
+        shareKeys();
+        const keys = {
+            ",": () => this.step(-1),
+            ".": () => this.step(1),
+            b: () => this.step(0),
+            p: () => find("compare").hidden || this.box.click()
+        };
+        window.addEventListener("keydown", (event) => {
+            if (event.ctrlKey || event.metaKey || event.altKey) return;
+            const act = keys[event.key.toLowerCase()];
+            if (act) act();
+        });
     }
 
     step(by) {
@@ -39,7 +78,8 @@ class Panel {
         const beside = this.box.checked && shot.photo !== "";
         find("photo").hidden = !beside;
         find("stage").classList.toggle("beside", beside);
-        if (beside) find("photo").querySelector("img").src = shot.photo;
+        const image = find("photo").querySelector("img");
+        if (beside) Object.assign(image, { src: shot.photo, alt: `Photograph ${shot.name}` });
         const role = shot.held_out ? "training never saw it" : "used in training";
         find("photo").querySelector("figcaption").textContent = `${shot.name}: ${role}`;
         find("note").textContent = "";

@@ -57,11 +57,50 @@ function centresOf(app) {
     return resource.centers || resource.gsplatData.getCenters();
 }
 
+// A word for the shell of this system: in Windows' shells double quotes hold a name, elsewhere single.
+function quoted(word) {
+    if (/^[\w@%+=:./-]+$/.test(word)) return word;
+    return /^Win/.test(navigator.platform) ? `"${word}"` : `'${word.replaceAll("'", "'\\''")}'`;
+}
+
+// The opacities that the viewer draws: those of splats that are left out become 0.
+class Colours {
+    constructor(app) {
+        this.component = app.root.findByName("gsplat").gsplat;
+        this.texture = this.component.resource.streams.getTexture("splatColor");
+        this.alphas = this.texture.lock().filter((_, i) => i % 4 === 3);
+        this.texture.unlock();
+        this.hidden = new Set();
+        this.changed = false;
+    }
+
+    show(index, stays) {
+        if (this.hidden.has(index) !== stays) return;
+        this.changed = true;
+        if (stays) this.hidden.delete(index);
+        else this.hidden.add(index);
+    }
+
+    apply() {
+        if (!this.changed) return;
+        this.changed = false;
+        const pixels = this.texture.lock();
+        for (let i = 0; i < this.alphas.length; i++) {
+            pixels[4 * i + 3] = this.hidden.has(i) ? 0 : this.alphas[i];
+        }
+        this.texture.unlock();
+        this.component.workBufferUpdate = 1; // once
+    }
+}
+
 class Selection {
-    constructor(scene, app) {
+    // source: () => a response with the .ply of the splats; null where they stream.
+    constructor(scene, app, source) {
         this.scene = scene;
         this.app = app;
+        this.source = source;
         this.centres = centresOf(app);
+        this.colours = this.centres && new Colours(app);
         this.chain = [];
         this.region = null;
         this.corners = [];
@@ -74,6 +113,8 @@ class Selection {
         find("keep").onclick = () => this.add("crop");
         find("drop").onclick = () => this.add("drop");
         find("undo").onclick = () => this.undo();
+        find("save").onclick = () => this.save();
+        find("save").hidden = !source;
         find("copy").onclick = () => {
             find("chain").select();
             document.execCommand("copy"); // the newer way is not there for a page from disk
@@ -149,23 +190,36 @@ class Selection {
         let left = 0;
         const at = this.centres || [];
         for (let i = 0; i < at.length; i += 3) {
-            if (!this.left(at[i], at[i + 1], at[i + 2])) continue;
+            const stays = this.left(at[i], at[i + 1], at[i + 2]);
+            this.colours.show(i / 3, stays);
+            if (!stays) continue;
             left++;
             if (this.region && this.region.holds(at[i], at[i + 1], at[i + 2])) this.chosen.push(i);
         }
         const count = (n) => n.toLocaleString("en");
         const summary = this.region ? `${count(this.chosen.length)} of ${count(left)} selected` : `${count(left)} left`;
         find("chosen").textContent = this.centres ? summary : "";
-        for (const name of ["keep", "drop"]) find(name).disabled = !this.region;
-        find("undo").disabled = find("copy").disabled = !this.chain.length;
-        const words = this.chain.map(({ word, region }) => `--${word} ${region.text}`);
-        find("chain").value = [`splat edit ${this.source()} OUT`, ...words].join(" ");
+        const some = this.region && (this.chosen.length || !this.centres);
+        for (const name of ["keep", "drop"]) find(name).disabled = !some;
+        for (const name of ["undo", "save", "copy"]) find(name).disabled = !this.chain.length;
+        if (this.centres && !left) find("save").disabled = true;
+        const words = this.chain.map(({ word, region }) => `--${word} "${region.text}"`);
+        find("chain").value = [`splat edit ${quoted(this.scene.source)} edited.ply`, ...words].join(" ");
+        if (this.colours) this.colours.apply();
         this.app.renderNextFrame = true;
     }
 
-    source() {
-        const { source } = this.scene;
-        return /^[\w@%+=:,./-]+$/.test(source) ? source : `'${source.replaceAll("'", "'\\''")}'`;
+    async save() {
+        try {
+            const bytes = new Uint8Array(await (await this.source()).arrayBuffer());
+            const link = document.createElement("a");
+            link.href = URL.createObjectURL(filtered(bytes, (x, y, z) => this.left(x, y, z)));
+            link.download = "edited.ply";
+            link.click();
+            setTimeout(() => URL.revokeObjectURL(link.href), 60000);
+        } catch (error) {
+            find("chosen").textContent = `Not saved: ${error.message}`;
+        }
     }
 
     paint() {
@@ -175,7 +229,9 @@ class Selection {
         if (canvas.height !== height) canvas.height = height;
         const pen = canvas.getContext("2d");
         pen.clearRect(0, 0, width, height);
-        if (!this.region && !this.corners.length) return;
+        const nothing = !this.region && !this.corners.length;
+        canvas.style.opacity = nothing ? 0 : 1; // Chromium may go on showing what was cleared
+        if (nothing) return;
         const view = viewOf(this.app);
         pen.fillStyle = pen.strokeStyle = "#fc0";
         const step = Math.ceil(this.chosen.length / DOTS) || 1;
