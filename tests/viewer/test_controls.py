@@ -76,7 +76,7 @@ def test_on_a_phone_nothing_lies_over_the_scene_and_a_finger_meets_each_control(
 
 
 def press(browser: Browser, key: str, code: int = 0) -> None:
-    text = {"text": key} if len(key) == 1 else {}
+    text: dict[str, Any] = {"text": key} if len(key) == 1 else {}
     for kind in ("keyDown", "keyUp"):
         browser.call(
             *("Input.dispatchKeyEvent",),
