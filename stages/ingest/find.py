@@ -72,6 +72,7 @@ def find(folder: Path, more_masks: Path | None = None, depth: Path | None = None
         raws=kinds["raw"],
         other_pictures=kinds["other"],
         others=len(names) - sum(map(len, (photographs, beside_frames, *kinds.values()))),
+        not_files=_not_files(folder),
         masks=mask_of,
         stray_masks=stray,
         depths=depths,
@@ -190,11 +191,31 @@ def _walk(folder: Path) -> Iterable[Path]:
         ) from error
 
     for place, folders, files in os.walk(folder, onerror=refuse):
-        folders[:] = [name for name in folders if not name.startswith(".") and name != "__MACOSX"]
+        folders[:] = [name for name in folders if not _is_hidden(name)]
         for name in files:
             path = Path(place, name)
             if not name.startswith(".") and path.is_file():
                 yield path
+
+
+def _not_files(folder: Path) -> dict[str, str]:
+    """See `Findings.not_files`."""
+    found = {}
+    for place, folders, files in os.walk(folder):
+        folders[:] = [name for name in folders if not _is_hidden(name)]
+        for path in (Path(place, name) for name in (*folders, *files) if not _is_hidden(name)):
+            why = ""
+            if path.is_dir():
+                why = "it is a link to a folder, which is not followed" if path.is_symlink() else ""
+            elif not path.is_file():
+                why = "it is a broken link" if path.is_symlink() else "it is a pipe or a device"
+            if why:
+                found[printable_name(path.relative_to(folder).as_posix())] = why
+    return found
+
+
+def _is_hidden(name: str) -> bool:
+    return name.startswith(".") or name == "__MACOSX"
 
 
 def _check_folder(folder: Path) -> None:
@@ -225,6 +246,7 @@ def _no_photographs(folder: Path, found: Findings) -> SplatError:
         "raw file": len(found.raws),
         "picture": len(found.other_pictures),
         "other file": found.others,
+        "link, pipe or device": len(found.not_files),
     }
     if not any(counts.values()):
         return SplatError(

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePosixPath
 
 from stages.base.errors import SplatError
-from stages.ingest.sources import Findings, folder_beside, stem_of
+from stages.ingest.sources import Findings, folder_beside
 
 FOLDER = "masks"  # beside the photographs' folder, or in it
 MASK_SUFFIXES = frozenset({".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg", ".webp"})
@@ -62,16 +62,21 @@ def check_pairing(found: Findings, apart: Path | None, chosen: Path | None) -> N
 
 
 def names_for(photograph: str, ending: str = "_mask") -> tuple[str, ...]:
-    """Names that the mask of a photograph ("day 1/a.jpg") may have, case-folded, without its own
-    suffix: those of COLMAP (a.jpg.png), nerfstudio (a.png) and Metashape (a_mask.png)."""
-    stem = str(PurePosixPath(photograph).with_suffix(""))
-    return photograph.casefold(), stem.casefold(), f"{stem}{ending}".casefold()
+    """Names that the mask of a photograph ("day 1/a.jpg") may have, without its own suffix: those
+    of COLMAP (a.jpg.png), nerfstudio (a.png) and Metashape (a_mask.png)."""
+    stem = _stem(photograph)
+    return photograph, stem, f"{stem}{ending}"
+
+
+def _stem(name: str) -> str:
+    return str(PurePosixPath(name).with_suffix(""))
 
 
 def pair_masks(
     photographs: Iterable[str], masks: Mapping[str, Path], ending: str = "_mask"
 ) -> dict[str, Path]:
-    """The mask of each photograph that has one, by the photograph's name.
+    """The mask of each photograph that has one, by the photograph's name. A name counts in its own
+    case before any other: x.jpg.png is for x.jpg, not for X.JPG beside it.
 
     The folder of masks need not have the photographs' sub-folders if no name is used twice.
 
@@ -81,12 +86,15 @@ def pair_masks(
         ending: see `names_for`.
     """
     photographs = list(photographs)
-    by_stem = {stem_of(name): path for name, path in sorted(masks.items())}
-    found = {}
-    for name in photographs:
-        match = next((by_stem[key] for key in names_for(name, ending) if key in by_stem), None)
-        if match is not None:
-            found[name] = match
+    found: dict[str, Path] = {}
+    for fold in (str, str.casefold):
+        used = set(found.values())
+        left = {name: path for name, path in sorted(masks.items()) if path not in used}
+        by_stem = {fold(_stem(name)): path for name, path in left.items()}
+        for name in photographs:
+            keys = [key for key in map(fold, names_for(name, ending)) if key in by_stem]
+            if keys and name not in found:
+                found[name] = by_stem[keys[0]]
     bare = [PurePosixPath(name).name for name in photographs]
     if not found and len({name.casefold() for name in bare}) == len(bare):
         short = {PurePosixPath(name).name: path for name, path in sorted(masks.items())}
@@ -104,8 +112,8 @@ def masks_beside(photographs: Iterable[str]) -> dict[str, str]:
     """Files of a folder that are masks of others there (a.jpg.png or a_mask.png beside a.jpg): the
     photograph's name by the mask's."""
     photographs = list(photographs)
-    by_key = {}
-    for name in photographs:
-        whole, _, marked = names_for(name)
-        by_key[whole] = by_key[marked] = name
-    return {name: by_key[stem_of(name)] for name in photographs if stem_of(name) in by_key}
+    found: dict[str, str] = {}
+    for fold in (str.casefold, str):  # the second is closer
+        keys = {fold(key): name for name in photographs for key in names_for(name)[::2]}
+        found |= {n: keys[fold(_stem(n))] for n in photographs if fold(_stem(n)) in keys}
+    return found

@@ -67,6 +67,8 @@ class Findings:
         beside_frames: names of pictures beside the frames of a 3D Scanner App scan, which are no
             photographs.
         others: how many files are something else.
+        not_files: why an entry is no file: broken links, links to folders, pipes and devices, by
+            their names.
         masks: mask files by the name of their photograph.
         stray_masks: mask files that belong to no photograph.
         depths: depth maps by the name of their photograph.
@@ -78,6 +80,7 @@ class Findings:
     raws: tuple[str, ...]
     other_pictures: tuple[str, ...]
     others: int
+    not_files: Mapping[str, str] = field(default_factory=dict)
     masks: Mapping[str, Path] = field(default_factory=dict)
     stray_masks: tuple[str, ...] = ()
     depths: Mapping[str, DepthFile] = field(default_factory=dict)

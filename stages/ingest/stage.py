@@ -104,6 +104,8 @@ def run(
     for source in found.videos:
         ingested += _ingest_video(source, settings, folder, report)
     unusable = [(one.name, str(one.error), one.error.hint) for one in ingested if one.error]
+    copied = "Copy the files themselves"
+    unusable += [(name, why, copied) for name, why in found.not_files.items()]
     advice.about_left_out("ingest-left-out", unusable, report.warn)
     bad = [(one.name, str(one.bad_depth), one.bad_depth.hint) for one in ingested if one.bad_depth]
     advice.about_left_out("ingest-depth-left-out", bad, report.warn)

@@ -78,6 +78,17 @@ def test_masks_may_lie_among_their_photographs() -> None:
     assert found == {"a_mask.png": "a.jpg", "b.jpg.png": "b.jpg"}
 
 
+def test_a_mask_is_for_the_photograph_whose_name_has_its_case() -> None:
+    found = masks_beside(["X.JPG", "x.jpg", "x.jpg.png"])
+    assert found == {"x.jpg.png": "x.jpg"}
+    assert masks_beside(["X.JPG", "x.jpg.png"]) == {"x.jpg.png": "X.JPG"}
+    for names in (["X.JPG", "x.jpg"], ["x.jpg", "X.JPG"]):
+        assert pair_masks(names, {"x.jpg.png": Path("x")}) == {"x.jpg": Path("x")}
+        both = {"x.jpg.png": Path("x"), "X.JPG.png": Path("X")}
+        assert pair_masks(names, both) == {"x.jpg": Path("x"), "X.JPG": Path("X")}
+    assert pair_masks(["X.JPG"], {"x.jpg.png": Path("x")}) == {"X.JPG": Path("x")}
+
+
 def test_sub_folders_tell_masks_apart_and_may_be_left_out_where_names_do() -> None:
     deep = {name: Path(name) for name in ("one/a.png", "two/a.png")}
     found = pair_masks(["one/a.jpg", "two/a.jpg"], deep)

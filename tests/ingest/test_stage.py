@@ -334,6 +334,19 @@ def test_a_file_under_another_formats_name_is_read_by_its_content(photos: Path) 
     assert np.abs(picture(capture, "x.jpg") - textured(4)).mean() < 3
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes of this kind")
+def test_links_and_pipes_among_the_photographs_are_named_and_counted(photos: Path) -> None:
+    folder_of(photos.parent / "more")
+    (photos / "broken.jpg").symlink_to(photos / "nothing.jpg")
+    (photos / "loop.jpg").symlink_to(photos / "loop.jpg")
+    (photos / "day 2").symlink_to(photos.parent / "more", target_is_directory=True)
+    os.mkfifo(photos / "pipe.jpg")
+    capture, warnings, report = ingested(photos)
+    assert (len(capture.photos), report.metrics["left_out"]) == (3, 4)
+    for name in ("broken.jpg", "loop.jpg", "day 2", "pipe.jpg"):
+        assert name in warnings["ingest-left-out"]
+
+
 def test_a_decompression_bomb_is_left_out(photos: Path) -> None:
     Image.new("1", (20000, 20000)).save(photos / "x.png")
     _, warnings, _ = ingested(photos)
