@@ -148,8 +148,9 @@ class Pipeline:
         """Run what has to run, up to and including the stage `until`.
 
         Args:
-            settings: dataclasses by stage name; recorded for later runs, except those of a stage
-                that refuses them or its inputs. The recorded ones are used where left out.
+            settings: dataclasses by stage name; recorded for later runs, except changes for a
+                stage that refuses them or its inputs, and for later ones. The recorded ones are
+                used where left out.
             until: name of the last stage; None for all, which share a limit of time.
             may_run: names of the stages that may run; it is an error if another one has to.
             listener: receives the events of the run.
@@ -177,13 +178,14 @@ class Pipeline:
                 planner = Planner(self.layout, run_file.photographs, wanted)
                 self._check_allowed(planner, until, may_run)
                 run_file.write(self.run_folder)
-                return self._run_all(
-                    planner,
-                    until,
-                    stop,
-                    listener,
-                    lambda name: run_file.with_settings_from(before, name).write(self.run_folder),
-                )
+
+                def forget(refusing: Stage) -> None:
+                    if before.settings_of([refusing])[refusing.name] != wanted[refusing.name]:
+                        later = self.layout.stages[self.layout.number(refusing) - 1 :]
+                        names = {stage.name for stage in later}
+                        run_file.with_settings_from(before, names).write(self.run_folder)
+
+                return self._run_all(planner, until, stop, listener, forget)
         except OSError as error:
             raise self._unusable(error) from error
         finally:
@@ -195,10 +197,11 @@ class Pipeline:
         until: str | None,
         stop: Event,
         listener: Listener,
-        forget: Callable[[str], None],
+        forget: Callable[[Stage], None],
     ) -> list[Manifest]:
-        """forget: records the settings of a stage as they were before, given its name: otherwise a
-        command without the refused option would fail as well."""
+        """forget: records the settings of a stage, and of later ones, as they were before, if the
+        command changed those of the stage: otherwise a command without the refused options, of
+        which one is named, would fail as well."""
         manifests, began = [], time.monotonic() if until is None else None
         for stage in self.layout.up_to(until):
             try:
@@ -211,9 +214,10 @@ class Pipeline:
                 else:
                     manifest = step.manifest
                     listener.skipped(stage, step.number, manifest)
-            except SplatError as error:
-                if error.family in (Family.USAGE, Family.INPUT):
-                    forget(stage.name)
+            except (SplatError, OSError) as error:
+                explained = as_splat_error(error, stage.name, self.run_folder)
+                if explained and explained.family in (Family.USAGE, Family.INPUT):
+                    forget(stage)
                 raise
             planner.learn(stage, manifest)
             manifests.append(manifest)

@@ -8,7 +8,7 @@ the stages identify the run folder, and the settings are read from them.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -62,12 +62,11 @@ class RunFile:
         changed = {name: settings_to_data(value) for name, value in settings.items()}
         return RunFile(self.photographs, {**self.settings, **changed})
 
-    def with_settings_from(self, other: RunFile, stage: str) -> RunFile:
-        """With the settings of one stage as `other` has them."""
-        settings = {name: value for name, value in self.settings.items() if name != stage}
-        if stage in other.settings:
-            settings[stage] = other.settings[stage]
-        return RunFile(self.photographs, settings)
+    def with_settings_from(self, other: RunFile, stages: Collection[str]) -> RunFile:
+        """With the settings of some stages as `other` has them."""
+        kept = {name: value for name, value in self.settings.items() if name not in stages}
+        back = {name: value for name, value in other.settings.items() if name in stages}
+        return RunFile(self.photographs, kept | back)
 
     def settings_of(
         self, stages: Sequence[Stage], otherwise: Mapping[str, Any] | None = None

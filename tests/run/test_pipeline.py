@@ -766,6 +766,31 @@ def test_settings_that_a_stage_refuses_are_not_recorded(
     assert settings["copy"].threads == 2
 
 
+@pytest.mark.parametrize("refusal", [OSError(errno.ENAMETOOLONG, "too long", "m" * 300), None])
+def test_wrong_settings_of_two_stages_do_not_keep_each_other_alive(
+    finished: Pipeline, run_folder: Path, refusal: Exception | None
+) -> None:
+    refusal = refusal or SplatError("x", given="1.", wanted="2.", hint="3.")
+    refusing = Pipeline(run_folder, stages=fake_stages(count=failing(refusal)))
+    wrong = {"count": CountSettings(iterations=1), "sign": SignSettings(names=("wrong",))}
+    with pytest.raises(SplatError):
+        refusing.run(wrong)
+    settings = finished.recorded_settings()
+    assert (settings["count"], settings["sign"]) == (CountSettings(), SignSettings())
+
+
+def test_settings_of_later_stages_stay_where_the_input_was_refused(
+    finished: Pipeline, photos: Path, run_folder: Path
+) -> None:
+    refusal = SplatError("x", given="1.", wanted="2.", hint="3.")
+    (photos / "c.jpg").write_text("three")
+    with pytest.raises(SplatError):
+        Pipeline(run_folder, stages=fake_stages(copy=failing(refusal))).run(
+            {"sign": SignSettings(names=("c",))}
+        )
+    assert finished.recorded_settings()["sign"].names == ("c",)
+
+
 def test_photographs_under_another_spelling_are_the_same(
     finished: Pipeline, photos: Path, run_folder: Path
 ) -> None:
