@@ -42,7 +42,7 @@ Cluster = Annotated[
     str | None,
     typer.Option(
         metavar="ADDRESS",
-        help="Ray cluster that executes runs, or the blocks and matching of one run (HOST:PORT, "
+        help="Ray cluster that executes runs, or the blocks of one run (HOST:PORT, "
         "ray://HOST:PORT, auto), or local:N for N workers on this machine. It needs "
         f"{_INSTALL_RAY}.",
         show_default="this process",

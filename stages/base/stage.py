@@ -98,8 +98,8 @@ def in_module(module: str) -> dict[str, Any]:
     """The arguments `run` and `load` of a `Stage`: functions of a module that is imported when one
     of them is called. Help, planning and status must not wait for NumPy and torch."""
 
-    def run(*given: Any, **more: Any) -> Any:
-        return importlib.import_module(module).run(*given, **more)
+    def run(*given: Any) -> Any:
+        return importlib.import_module(module).run(*given)
 
     def load(folder: Path) -> Any:
         return importlib.import_module(module).load(folder)

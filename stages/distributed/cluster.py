@@ -24,8 +24,8 @@ from stages.distributed.remote import Location
 from stages.distributed.tasks import (
     Executor,
     Resources,
+    RunTask,
     SerialExecutor,
-    Task,
     TaskResult,
     run_task,
 )
@@ -70,7 +70,7 @@ class RayExecutor:
     workers: tuple[Worker, ...]
 
     def results(
-        self, tasks: Sequence[Task], need: Resources, stop: Event | None = None
+        self, tasks: Sequence[RunTask], need: Resources, stop: Event | None = None
     ) -> Iterator[tuple[int, TaskResult]]:
         """See `tasks.Executor`. Raises SplatError "cluster-too-small"."""
         cpus, memory_mib = self.allocation(len(tasks), need)
@@ -116,7 +116,7 @@ class RayExecutor:
             return TaskResult(int(Family.RESOURCES), "worker-lost", f"Its worker was lost: {why}")
 
 
-def _with_threads(task: Task, threads: int) -> TaskResult:
+def _with_threads(task: RunTask, threads: int) -> TaskResult:
     os.environ["SPLAT_THREADS"] = str(threads)
     result = run_task(task)
     host = f" (On {socket.gethostname()}.)"  # for errors of that machine, such as a full disk

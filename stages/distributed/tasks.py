@@ -20,21 +20,9 @@ from stages.distributed.remote import Location, local_copies
 from stages.run.failures import as_splat_error
 from stages.run.listener import Listener, Listeners
 from stages.run.pipeline import Pipeline
-from stages.sfm.worker.chunks import Chunk, run_chunk
 from stages.train.cap import needed_mib
 
 _log = logging.getLogger(__name__)
-
-
-class Task(Protocol):
-    """Work for one worker. folder: where its output lies."""
-
-    @property
-    def folder(self) -> Path: ...
-
-    def run(self, listener: Listener | None = None) -> None:
-        """Do the work in this process and report its events to the listener. Raises SplatError and
-        any other exception."""
 
 
 @dataclass(frozen=True)
@@ -73,20 +61,6 @@ def task_for(run_folder: Location, photos: Location, settings: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class ChunkTask:
-    """A chunk of features or matches."""
-
-    chunk: Chunk
-
-    @property
-    def folder(self) -> Path:
-        return self.chunk.out.parent
-
-    def run(self, listener: Listener | None = None) -> None:
-        run_chunk(self.chunk)
-
-
-@dataclass(frozen=True)
 class TaskResult:
     """How a task ended. status: exit status. code, message: of the error; "" if there was none."""
 
@@ -113,7 +87,7 @@ class Executor(Protocol):
     """Executes tasks, one or several at a time."""
 
     def results(
-        self, tasks: Sequence[Task], need: Resources, stop: Event | None = None
+        self, tasks: Sequence[RunTask], need: Resources, stop: Event | None = None
     ) -> Iterator[tuple[int, TaskResult]]:
         """Yield (number of the task, its result) in the order in which tasks end.
 
@@ -125,7 +99,7 @@ OpenExecutor = Callable[[Path, Listener], AbstractContextManager[Executor]]
 """open_executor(folder, listener): an executor for tasks in that folder."""
 
 
-def run_task(task: Task, listener: Listener | None = None) -> TaskResult:
+def run_task(task: RunTask, listener: Listener | None = None) -> TaskResult:
     """Run a task in this process. A failure becomes a result; only Interrupted is raised."""
     try:
         task.run(listener)
@@ -141,7 +115,7 @@ def run_task(task: Task, listener: Listener | None = None) -> TaskResult:
 
 def run_all(
     executor: Executor,
-    tasks: Sequence[Task],
+    tasks: Sequence[RunTask],
     need: Resources,
     stop: Event,
     progress: Callable[[int], None],
@@ -184,7 +158,7 @@ class SerialExecutor:
     listener: Listener | None = None
 
     def results(
-        self, tasks: Sequence[Task], need: Resources, stop: Event | None = None
+        self, tasks: Sequence[RunTask], need: Resources, stop: Event | None = None
     ) -> Iterator[tuple[int, TaskResult]]:
         for number, task in enumerate(tasks):
             if stop is not None and stop.is_set():

@@ -3,8 +3,7 @@
 In reading order, without known cameras:
 - `settings`, `stage`: the options; the stage from its input to its files.
 - `checks.fallbacks` lists configurations and tries them; `checks.attempt_runner` runs one of them.
-- `worker.process` runs one step (`worker.job`) in a process of its own; `worker.chunks` splits the
-  first steps for executors.
+- `worker.process` runs one step (`worker.job`) in a process of its own.
 - In that process: `worker.features` (SIFT), then pairs of photographs by `worker.retrieval` over a
   `worker.vocabulary` and by `worker.pairs`, `worker.matching`, and `worker.mapping`.
 - `learned`: features for the photographs that SIFT leaves out.

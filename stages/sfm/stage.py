@@ -29,7 +29,6 @@ from stages.sfm.place.crs import projected_system
 from stages.sfm.place.metric_scale import KnownScale
 from stages.sfm.reconstruction_files import load_reconstruction
 from stages.sfm.settings import SfmSettings
-from stages.sfm.worker.chunks import ChunkExecutor
 from stages.sfm.worker.job import Sift, prepare_work_folder, project_of
 
 _FEWEST_PHOTOGRAPHS = 3
@@ -38,11 +37,7 @@ _WORK = "work"
 
 
 def run(
-    inputs: Mapping[str, Any],
-    settings: SfmSettings,
-    folder: Path,
-    report: Report,
-    executor: ChunkExecutor | None = None,
+    inputs: Mapping[str, Any], settings: SfmSettings, folder: Path, report: Report
 ) -> Reconstruction:
     """Reconstruct the capture in inputs["ingest"]; see the module's docstring.
 
@@ -54,8 +49,6 @@ def run(
         settings: see `SfmSettings`.
         folder: may hold what an interrupted run left.
         report: receives metrics, warnings and progress.
-        executor: runs chunks of features and matching (`sfm.worker.chunks`) in parallel; the result
-            has the same bytes.
 
     Raises SplatError of family RECONSTRUCTION when no reconstruction passes, and Interrupted.
     """
@@ -69,7 +62,7 @@ def run(
     if settings.cameras is not None:
         found, seconds = _from_known_cameras(capture, settings, settings.cameras, folder, report)
     else:
-        found, seconds = _from_photographs(capture, settings, folder, report, executor)
+        found, seconds = _from_photographs(capture, settings, folder, report)
     found = light.with_light(found, report)
     reconstruction_files.save_reconstruction(folder, found)
     report.metric("levelled", found.levelled)
@@ -87,7 +80,6 @@ def _from_photographs(
     settings: SfmSettings,
     folder: Path,
     report: Report,
-    executor: ChunkExecutor | None,
 ) -> tuple[Reconstruction, dict[str, float]]:
     """(the reconstruction, seconds by step)."""
     _check_duplicates(capture)
@@ -103,7 +95,6 @@ def _from_photographs(
         deadline=time.monotonic() + 60.0 * settings.max_minutes,
         allow_partial=settings.allow_partial,
         join_all=features == "learned",
-        executor=executor,
     )
     attempts = fallbacks.try_configurations(
         runner.run_configuration,

@@ -135,25 +135,3 @@ def test_blocks_are_the_same_whoever_trains_them(folder: Path) -> None:
         address, kills = f"local:{workers}", int(workers == 2)
         found = blocks_of(folder, f"by-{workers}", "--cluster", address, kills=kills)
         assert found == here, workers
-
-
-def cameras_of(folder: Path, address: str | None, kills: int = 0) -> dict[str, str]:
-    """Outputs of the sample's first two stages."""
-    name = f"at-{address}"
-    code = (
-        "from pathlib import Path; from splatcli import run_settings; "
-        "from splatcli.distribution import distributed; "
-        "from stages.run.pipeline import Pipeline; "
-        f"whole = Pipeline(Path({name!r}), Path({str(sample.PHOTOS)!r})); "
-        f"distributed(whole, {address!r}).run(run_settings.defaults(), until='sfm')"
-    )
-    assert with_kills(folder, processes.python(code), kills) == kills
-    return outputs(folder / name, "")
-
-
-def test_shares_of_structure_are_the_same_whoever_does_them(tmp_path: Path) -> None:
-    here = cameras_of(tmp_path, None)
-    assert len(here) > 24
-    for workers in (1, 2, 4):
-        found = cameras_of(tmp_path, f"local:{workers}", kills=int(workers == 2))
-        assert found == here, workers

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import median
@@ -30,18 +28,12 @@ from stages.sfm.checks.gates import (
 )
 from stages.sfm.checks.statistics import model_statistics
 from stages.sfm.worker import database as sqlite
-from stages.sfm.worker.chunks import (
-    ChunkExecutor,
-    extract_features_in_chunks,
-    match_pairs_in_chunks,
-)
 from stages.sfm.worker.job import (
     Features,
     Job,
     Learned,
     Mapping,
     Matching,
-    PairSelection,
     Project,
     Sift,
 )
@@ -64,7 +56,6 @@ class AttemptRunner:
         deadline: of all configurations together, in seconds of `time.monotonic`.
         allow_partial: go on to mapping although the gates before it failed.
         join_all: match learned features for all photographs, also for those that SIFT registers.
-        executor: runs chunks of features and matching; None: one worker process does it all.
         seconds: wall-clock seconds of each step so far, over all configurations.
     """
 
@@ -75,7 +66,6 @@ class AttemptRunner:
     deadline: float
     allow_partial: bool = False
     join_all: bool = False
-    executor: ChunkExecutor | None = None
     seconds: dict[str, float] = field(default_factory=dict)
 
     def out_of_time(self) -> bool:
@@ -159,32 +149,18 @@ class AttemptRunner:
         marker = project.database.with_suffix(".features-done")
         if not (marker.exists() and project.database.exists()):
             sqlite.repair_or_delete(project.database)
-            job = Features(project, sift)
-            if self.executor is not None:
-                with self._timed("features"):
-                    extract_features_in_chunks(job, self.executor, self._check_deadline)
-            self._run(job)
+            self._run(Features(project, sift))
             marker.touch()
         return project
 
     def _with_matches(self, project: Project, configuration: Configuration) -> Project:
         """Match; returns the project with the database of the two-view geometries to use."""
         how = "exhaustive" if configuration.more_features else self.matching
-        if configuration.drop_stationary:
-            source = project.database
-            project = replace(project, database=source.with_name(source.stem + "-moving.db"))
-            if not project.database.exists():
-                sqlite.copy(source, project.database)
-                sqlite.delete_geometries(project.database)
         marker = project.database.with_suffix(f".{how}-done")
         if marker.exists() and project.database.exists():
             return project
-        if not configuration.drop_stationary:
-            sqlite.repair(project.database)
-        job = Matching(project, how, configuration.drop_stationary)
-        if self.executor is not None:
-            self._match_in_chunks(job, self.executor)
-        self._run(job)
+        sqlite.repair(project.database)
+        self._run(Matching(project, how))
         marker.touch()
         return project
 
@@ -215,18 +191,6 @@ class AttemptRunner:
             registered = set(np.flatnonzero(np.isin(frames, linked)).tolist())
         return tuple(i for i in range(len(all_names)) if i not in registered)
 
-    def _match_in_chunks(self, job: Matching, executor: ChunkExecutor) -> None:
-        """Match until no pair is left to select; the selection depends on earlier matches."""
-        left = 1
-        while left:
-            self._run(PairSelection(job.project, job.how))
-            with self._timed("matching"):
-                left = match_pairs_in_chunks(job, executor, self._check_deadline)
-
-    def _check_deadline(self) -> None:
-        if self.out_of_time():
-            raise WorkerTimedOut(len(self.project.photographs))
-
     def _map(self, project: Project, configuration: Configuration) -> None:
         out = self._model_folder(configuration)
         if _is_mapped(out):
@@ -241,16 +205,12 @@ class AttemptRunner:
     def _run(self, job: Job, suffix: str = "", max_seconds: float | None = None) -> None:
         """Run one step in a worker. suffix: of the phases in progress reports."""
         seconds = self.seconds_left() if max_seconds is None else max_seconds
-        with self._timed("matching" if job.step == "pair selection" else job.step):
-            run_step(job, self.project.database.parent, self.report, seconds, suffix)
-
-    @contextmanager
-    def _timed(self, step: str) -> Iterator[None]:
         started = time.monotonic()
         try:
-            yield
+            run_step(job, self.project.database.parent, self.report, seconds, suffix)
         finally:
-            self.seconds[step] = self.seconds.get(step, 0.0) + time.monotonic() - started
+            spent = self.seconds.get(job.step, 0.0) + time.monotonic() - started
+            self.seconds[job.step] = spent
 
 
 def mapping_seconds(photographs: int) -> float:

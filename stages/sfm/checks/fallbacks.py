@@ -23,14 +23,13 @@ class Configuration:
         more_features: lower SIFT's peak threshold, allow more features, and match every pair,
             whatever the settings say.
         learned: add learned features and their matches to SIFT's.
-        drop_stationary, loose, strongest_start: as in `job.Job`.
+        loose, strongest_start: as in `job.Mapping`.
         fixes: codes of the failures after which this configuration is tried.
     """
 
     name: str
     more_features: bool = False
     learned: bool = False
-    drop_stationary: bool = False
     loose: bool = False
     strongest_start: bool = False
     fixes: frozenset[str] = frozenset()
@@ -39,8 +38,6 @@ class Configuration:
 _UNREGISTERED = frozenset({"sfm-too-few-registered", "sfm-no-model"})
 _SPARSE = frozenset({"sfm-too-few-points", "sfm-too-few-features"})
 _UNCONNECTED = frozenset({"sfm-separate-groups", "sfm-no-matches"})
-_CAMERA = frozenset({"sfm-implausible-distortion", "sfm-implausible-focal"})
-
 _FALSE_JOIN = frozenset({"sfm-weak-link", "sfm-contradictions"})
 
 LEARNED = Configuration(
@@ -52,7 +49,6 @@ LEARNED = Configuration(
 ANOTHER_START = Configuration("another initial pair", strongest_start=True)
 CONFIGURATIONS = (  # by SIFT alone
     Configuration("standard"),
-    Configuration("without stationary matches", drop_stationary=True, fixes=_CAMERA),
     Configuration("looser registration", loose=True, fixes=_UNREGISTERED | {"sfm-crashed"}),
     Configuration(
         "more features",

@@ -31,10 +31,6 @@ def main(arguments: list[str]) -> int:
         # with known cameras
         jobs.Neighbours: triangulation.match_neighbours,
         jobs.Triangulation: triangulation.triangulate,
-        # with an executor
-        jobs.FeaturesChunk: features.extract_chunk,
-        jobs.PairSelection: matching.select_pairs,
-        jobs.MatchingChunk: matching.match_chunk,
     }
     steps[type(job)](job)
     return 0

@@ -7,7 +7,6 @@ Nothing here imports pycolmap.
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
 from threading import Lock
@@ -121,18 +120,6 @@ class StoredFeatures:
         return None if row is None else row[0] or b""
 
 
-def merge_chunks(database: Path, chunks: Iterable[Path]) -> None:
-    """Move features and matches from the databases of finished `chunks` into `database`; rows that
-    it has already stay. Each chunk is deleted after its transaction."""
-    for chunk in chunks:
-        uri = database.absolute().as_uri()
-        with closing(sqlite3.connect(uri, uri=True, timeout=30.0)) as connection, connection:
-            connection.execute("ATTACH ? AS other", (f"{chunk.absolute().as_uri()}?immutable=1",))
-            for table in ("keypoints", "descriptors", "matches", "two_view_geometries"):
-                connection.execute(f"INSERT OR IGNORE INTO {table} SELECT * FROM other.{table}")
-        chunk.unlink()
-
-
 def delete(database: Path) -> None:
     """Remove the database and the files that SQLite keeps beside it."""
     for suffix in ("", "-wal", "-shm", "-journal"):
@@ -147,13 +134,6 @@ def copy(source: Path, target: Path) -> None:
         old.backup(new)
     delete(target)
     partial.replace(target)
-
-
-def delete_geometries(database: Path) -> None:
-    """Delete the two-view geometries, and keep the matches."""
-    with closing(sqlite3.connect(database, timeout=30.0)) as connection:
-        connection.execute("DELETE FROM two_view_geometries")
-        connection.commit()
 
 
 def _selected(database: Path, what: str) -> list[tuple[int, ...]]:

@@ -22,11 +22,9 @@ from stages.sfm.worker import database as sqlite
 from stages.sfm.worker import new_database
 from stages.sfm.worker.job import (
     Features,
-    FeaturesChunk,
     Photographs,
     Project,
     Sift,
-    chunks_path,
 )
 from stages.sfm.worker.progress import ProgressWriter
 
@@ -41,21 +39,13 @@ KeypointsAndDescriptors = tuple[NDArray[np.float32], NDArray[np.uint8]]
 
 
 def extract_features(job: Features) -> None:
-    """Write the SIFT features of every photograph to the database, which may already hold some;
-    features of finished chunks are merged first."""
+    """Write the SIFT features of every photograph to the database, which may already hold some."""
     path, photographs = job.project.database, job.project.photographs
     if not path.exists():
         new_database.create(path, photographs)
-    sqlite.merge_chunks(path, sorted(chunks_path(path).glob("*.db")))
     have = sqlite.photographs_with_features(path)
     missing = [position for position in range(len(photographs)) if position not in have]
     _extract(job.project, job.sift, missing, len(have))
-
-
-def extract_chunk(job: FeaturesChunk) -> None:
-    """Write the features of some photographs to a database of their own."""
-    new_database.create(job.project.database, job.project.photographs, job.positions)
-    _extract(job.project, job.sift, job.positions, 0)
 
 
 def _extract(project: Project, sift: Sift, missing: Sequence[int], have: int) -> None:

@@ -133,51 +133,11 @@ class Features(Job):
 
 
 @dataclass(frozen=True)
-class FeaturesChunk(Job):
-    """Extract the features of the photographs at `positions`, into the project's database, which is
-    new."""
-
-    step = "features chunk"
-    sift: Sift
-    positions: tuple[int, ...]
-
-
-@dataclass(frozen=True)
 class Matching(Job):
-    """Match and verify pairs.
-
-    Args:
-        how: "auto" (pairs that look alike), "exhaustive" or "sequential".
-        drop_stationary: drop matches that stay in place in the picture (a date stamp).
-    """
+    """Match and verify pairs. how: "auto" (pairs that look alike), "exhaustive" or "sequential"."""
 
     step = "matching"
     how: str
-    drop_stationary: bool = False
-
-
-@dataclass(frozen=True)
-class PairSelection(Job):
-    """Merge finished chunks and select the pairs to match next. how: as in `Matching`."""
-
-    step = "pair selection"
-    how: str
-
-
-@dataclass(frozen=True)
-class MatchingChunk(Job):
-    """Match and verify some pairs, into the project's database, which is new.
-
-    Args:
-        source: the database with the features.
-        pairs: of positions.
-        drop_stationary: as in `Matching`.
-    """
-
-    step = "matching chunk"
-    source: Path
-    pairs: tuple[Pair, ...]
-    drop_stationary: bool
 
 
 @dataclass(frozen=True)
@@ -311,13 +271,3 @@ def similarity_path(database: Path) -> Path:
 def vocabulary_path(database: Path) -> Path:
     """File with the vocabulary of the features in `database`: [W, 128]."""
     return database.with_suffix(".vocabulary.npy")
-
-
-def selected_pairs_path(database: Path) -> Path:
-    """File with the pairs that the step "pair selection" selected to match next, as JSON."""
-    return database.with_suffix(".pairs.json")
-
-
-def chunks_path(database: Path) -> Path:
-    """Folder for finished chunks, which are merged into `database`."""
-    return database.with_suffix(".chunks")

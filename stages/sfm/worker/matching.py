@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import functools
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
-from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -15,15 +13,11 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.sfm.worker import database as sqlite
-from stages.sfm.worker import new_database, pairs, retrieval
+from stages.sfm.worker import pairs, retrieval
 from stages.sfm.worker.descriptor_matching import match_descriptors
 from stages.sfm.worker.job import (
     Matching,
-    MatchingChunk,
-    PairSelection,
     Project,
-    chunks_path,
-    selected_pairs_path,
     similarity_path,
     vocabulary_path,
 )
@@ -46,7 +40,7 @@ _CACHED = 256  # photographs whose feature indices stay in memory
 
 def match_all(job: Matching) -> None:
     """Match and verify pairs of photographs, except those that the database holds."""
-    with _matcher(job.project, job.drop_stationary) as matcher:
+    with _matcher(job.project) as matcher:
         for wanted in _rounds(job.project, job.how, matcher.features, matcher.inliers):
             matcher.run(wanted)
 
@@ -57,46 +51,15 @@ def match_pairs(project: Project, wanted: Sequence[Pair]) -> None:
         matcher.run(wanted)
 
 
-def select_pairs(job: PairSelection) -> None:
-    """Merge finished chunks, and write the pairs to match next (`selected_pairs_path`): none once
-    `match_all` would find nothing to do."""
-    database = job.project.database
-    sqlite.merge_chunks(database, sorted(chunks_path(database).glob("*.db")))
-    inliers = sqlite.inliers_of_pairs(database)
-    missing: list[Pair] = []
-    with closing(sqlite.StoredFeatures(database)) as stored:
-        features = _IndexedFeatures(job.project, stored, database)
-        features.vocabulary()  # built once, and not in each chunk
-        for wanted in _rounds(job.project, job.how, features, inliers):
-            missing = [pair for pair in wanted if pair not in inliers]
-            if missing:
-                break
-    selected_pairs_path(database).write_text(json.dumps(missing))
-
-
-def match_chunk(job: MatchingChunk) -> None:
-    """Match and verify some pairs, into a database of their own."""
-    new_database.create(job.project.database, job.project.photographs, ())
-    with _matcher(job.project, job.drop_stationary, job.source) as matcher:
-        matcher.run(job.pairs)
-
-
 @contextmanager
-def _matcher(
-    project: Project, drop_stationary: bool = False, source: Path | None = None
-) -> Iterator[_Matcher]:
+def _matcher(project: Project) -> Iterator[_Matcher]:
     """A matcher. Its reader is closed before its writer, because the last to close a database
-    tidies it up.
-
-    source: another database to read features from, which nothing writes to meanwhile.
-    """
-    path = source or project.database
+    tidies it up."""
     with (
         pycolmap.Database.open(project.database) as database,
-        closing(sqlite.StoredFeatures(path, immutable=source is not None)) as stored,
+        closing(sqlite.StoredFeatures(project.database)) as stored,
     ):
-        features = _IndexedFeatures(project, stored, path)
-        yield _Matcher(project, database, features, drop_stationary)
+        yield _Matcher(project, database, _IndexedFeatures(project, stored))
 
 
 def _rounds(
@@ -124,20 +87,17 @@ def _rounds(
 
 
 class _IndexedFeatures:
-    """Features of photographs by position, indexed by visual word; for several threads.
+    """Features of photographs by position, indexed by visual word; for several threads."""
 
-    stored, source: the features, and the database that they are in.
-    """
-
-    def __init__(self, project: Project, stored: sqlite.StoredFeatures, source: Path) -> None:
-        self._project, self._source, self.stored = project, source, stored
+    def __init__(self, project: Project, stored: sqlite.StoredFeatures) -> None:
+        self._project, self.stored = project, stored
         self.vocabulary = functools.cache(self._vocabulary)
         self.index = functools.lru_cache(_CACHED)(self._index)
         self.points = functools.lru_cache(_CACHED)(stored.points)
 
     def _vocabulary(self) -> NDArray[np.float32]:
-        """Of all photographs; stored beside the database, for chunks and resumed runs."""
-        path, photographs = vocabulary_path(self._source), len(self._project.photographs)
+        """Of all photographs; stored beside the database for resumed runs."""
+        path, photographs = vocabulary_path(self._project.database), len(self._project.photographs)
         if not path.exists():
             progress = ProgressWriter(self._project.database)
             most = max(1, SAMPLED_DESCRIPTORS // photographs)
@@ -169,12 +129,10 @@ class _Matcher:
         project: Project,
         database: pycolmap.Database,
         features: _IndexedFeatures,
-        drop_stationary: bool,
     ) -> None:
         self.features = features
         self.inliers = sqlite.inliers_of_pairs(project.database)
         self._project, self._database = project, database
-        self._drop_stationary = drop_stationary
         self._cameras = cameras_of(project, database)
         self._progress = ProgressWriter(project.database)
 
@@ -188,26 +146,18 @@ class _Matcher:
                 missing, pool.map(self._match, missing), strict=True
             ):
                 first, second = pair[0] + 1, pair[1] + 1
-                if matches is not None:
-                    self._database.write_matches(first, second, matches)
+                self._database.write_matches(first, second, matches)
                 self._database.write_two_view_geometry(first, second, geometry)
                 self.inliers[pair] = len(geometry.inlier_matches)
                 done += 1
                 self._progress.write("matching", done, len(wanted))
 
-    def _match(self, pair: Pair) -> tuple[NDArray[np.uint32] | None, pycolmap.TwoViewGeometry]:
-        """(matches; None if the database has them, two-view geometry; without inliers if it has too
-        few)."""
-        first, second = pair
-        known = self.features.stored.matches(first, second)
-        matches = known
-        if matches is None:
-            matches = match_descriptors(self.features.index(first), self.features.index(second))
+    def _match(self, pair: Pair) -> tuple[NDArray[np.uint32], pycolmap.TwoViewGeometry]:
+        """(matches, two-view geometry; without inliers if it has too few)."""
+        matches = match_descriptors(*map(self.features.index, pair))
         sides = [(self._cameras[position], self.features.points(position)) for position in pair]
-        geometry = two_view_geometry(
-            sides[0], sides[1], matches, self._project.seed, self._drop_stationary
-        )
-        return (matches if known is None else None), geometry
+        geometry = two_view_geometry(sides[0], sides[1], matches, self._project.seed)
+        return matches, geometry
 
 
 def cameras_of(project: Project, database: pycolmap.Database) -> list[pycolmap.Camera]:
@@ -255,7 +205,6 @@ def two_view_geometry(
     second: tuple[pycolmap.Camera, NDArray[np.float64]],
     matches: NDArray[np.uint32],
     seed: int,
-    drop_stationary: bool = False,
 ) -> pycolmap.TwoViewGeometry:
     """The two-view geometry of two photographs; without inliers if it has too few.
 
@@ -263,7 +212,6 @@ def two_view_geometry(
         first, second: the camera of a photograph and its keypoints [N, 2].
         matches: [M, 2] indices of keypoints.
         seed: of RANSAC.
-        drop_stationary: as in `job.Matching`.
     """
     nothing = pycolmap.TwoViewGeometry()
     if len(matches) < FEWEST_INLIERS:
@@ -272,6 +220,5 @@ def two_view_geometry(
     options.ransac.random_seed = seed
     options.ransac.max_num_trials = MOST_TRIALS
     options.compute_relative_pose = True  # also tells a pure rotation from a planar scene
-    options.filter_stationary_matches = drop_stationary
     found = pycolmap.estimate_two_view_geometry(*first, *second, matches, options)
     return found if len(found.inlier_matches) >= FEWEST_INLIERS else nothing

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +16,9 @@ from stages.sfm.worker.job import CameraGuess, Photographs
 FOCAL_WITHOUT_PRIOR = 1.2  # x the longer side: COLMAP's guess without EXIF
 
 
-def create(path: Path, photographs: Photographs, only: Collection[int] | None = None) -> None:
+def create(path: Path, photographs: Photographs) -> None:
     """Write a database with cameras and photographs, ids = position + 1; it appears at `path` when
-    it is complete. only: positions of the photographs to write, by default all.
+    it is complete.
 
     COLMAP's own import would trust EXIF focal lengths that are wrong after resizing.
     """
@@ -29,8 +29,6 @@ def create(path: Path, photographs: Photographs, only: Collection[int] | None = 
     frames: dict[int, pycolmap.Frame] = {}
     columns = photographs.names, photographs.camera_of, photographs.frame_of
     for image_id, (name, position, number) in enumerate(zip(*columns, strict=True), 1):
-        if only is not None and image_id - 1 not in only:
-            continue
         image = pycolmap.Image()
         image.image_id = image_id
         image.name = name

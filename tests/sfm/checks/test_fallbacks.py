@@ -71,12 +71,6 @@ def test_a_crash_of_the_mapper_tries_once_more() -> None:
     assert script.tried == ["standard", "looser registration"]
 
 
-def test_a_wrong_camera_drops_stationary_matches() -> None:
-    script = Script("sfm-implausible-distortion", without_stationary_matches=())
-    assert run(script).configuration.drop_stationary
-    assert script.tried == ["standard", "without stationary matches"]
-
-
 def test_few_features_are_followed_by_more_features_alone() -> None:
     script = Script("sfm-too-few-features")
     run(script)

@@ -16,7 +16,7 @@ import pytest
 
 from stages.base.errors import Interrupted, SplatError
 from stages.sfm.worker import process
-from stages.sfm.worker.job import Job, KnownCameras, MatchingChunk, Neighbours, Triangulation
+from stages.sfm.worker.job import Job, KnownCameras, Learned, Neighbours, Triangulation
 from tests import processes
 from tests.sfm.worker.jobs import job
 
@@ -44,8 +44,8 @@ def run(tmp_path: Path, stop: Event | None = None, max_seconds: float = 30.0) ->
 def test_a_job_survives_being_written(tmp_path: Path) -> None:
     project, file = job(tmp_path).project, tmp_path / "job.json"
     assert Job.read(job(tmp_path).write(file)) == job(tmp_path)
-    chunk = MatchingChunk(project, tmp_path / "b.db", ((0, 1), (0, 2)), drop_stationary=True)
-    assert Job.read(chunk.write(file)) == chunk
+    learned = Learned(project, tmp_path / "b.db", (0, 2))
+    assert Job.read(learned.write(file)) == learned
 
 
 def test_known_cameras_survive_being_written_exactly(tmp_path: Path) -> None:
