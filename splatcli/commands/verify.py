@@ -22,15 +22,7 @@ from stages.proof.losses import changes_shown
 from stages.proof.prover import Proof, Prover, cameras_for, provers_of
 from stages.run import results, runfolder
 from stages.run.pipeline import Pipeline
-from stages.scene import QuantisedSplats, Splats, View
-
-_ITSELF = "itself"
-_ONLY_ITSELF = (
-    "Two readers that share no code were compared: the file is whole and says the same to both. "
-    "That it is what was trained is not shown by this; name the original with --against."
-)
-
-_UNCHECKED = "could not be cross-checked"
+from stages.scene import QuantisedSplats, View
 
 
 @dataclass(frozen=True)
@@ -38,12 +30,11 @@ class _Original:
     """What files are compared with.
 
     name: for messages. provers_of: one for each model of splats that a file may hold, likeliest
-    first. itself: whether it is the file to verify.
+    first.
     """
 
     name: str
     provers_of: Callable[[Path], Iterable[Prover]]
-    itself: bool = False
 
 
 def verify(
@@ -62,8 +53,7 @@ def verify(
 ) -> None:
     """Verify a file: read it with a second parser, draw it, compare it with what was trained.
 
-    A file outside a run, without --against, is compared with itself: two parsers that share no
-    code must read the same. Exit status 7 if a file is wrong.
+    Exit status 7 if a file is wrong.
     """
     files = _files(target)
     for file in files:
@@ -74,11 +64,10 @@ def verify(
     for number, file in enumerate(files):
         console.step(f"verifying {file}", done=number, total=len(files))
         # Our own reader first: it reports damage that makes other parsers crash.
-        read = formats.read(file)
-        original = original or _original(file, against, read)
-        del read
+        formats.read(file)
+        original = original or _original(file, against)
         for prover in original.provers_of(file):
-            proof = prover.prove(file, exact=original.itself)
+            proof = prover.prove(file)
             if not proof.fault:
                 break
         found.append((file, proof))
@@ -109,26 +98,30 @@ def _files(target: Path | None) -> list[Path]:
     return [assets.folder / file.path for file in files]
 
 
-def _original(file: Path, against: Path | None, read: Splats) -> _Original:
-    """read: what our own reader finds in `file`."""
+def _original(file: Path, against: Path | None) -> _Original:
     if against is not None and not against.is_dir():
         around = (results.run_around(path) for path in (against, file))
         views = next(filter(None, map(results.views_of, around)), ())
-        return _of_file(str(against), against, formats.read(against), views)
+        return _of_file(against, views)
     if against is not None and not runfolder.is_run_folder(against):
         raise runfolder.missing(against)
     run = Pipeline(against) if against is not None else results.run_around(file)
-    if run is None or (against is None and run.manifest("quantise") is None):
-        return replace(_of_file(_ITSELF, file, read), itself=True)
+    if run is None:
+        raise UsageError(
+            "verify-no-original",
+            given=f"{file} is in no run's 7-export, and --against is not given.",
+            wanted="The original that the file must equal: a run folder or a splat file.",
+            hint="Name it with --against. `splat info` reads a file and describes it.",
+        )
     return _of_run(run)
 
 
-def _of_file(name: str, file: Path, read: Splats, views: tuple[View, ...] = ()) -> _Original:
-    """read: the splats of `file`. views: of the capture, if it is known."""
-    splats = drop_undrawable(read)[0]
+def _of_file(file: Path, views: tuple[View, ...]) -> _Original:
+    """views: of the capture, if it is known."""
+    splats = drop_undrawable(formats.read(file))[0]
     cameras = cameras_for(splats, views)
     prover = Prover.of(splats, cameras, source_format=format_of(file).ending)
-    return _Original(name, lambda verified: [prover])
+    return _Original(str(file), lambda verified: [prover])
 
 
 def _of_run(run: Pipeline) -> _Original:
@@ -158,9 +151,8 @@ def _facts(file: Path, proof: Proof, original: _Original) -> dict[str, Any]:
         "size_bytes": size,
         "bytes_per_splat": round(size / max(1, proof.splats), 2),
         **proof.figures,
-        "right": None if proof.unchecked else not proof.fault,
+        "right": not proof.fault,
         "fault": proof.fault,
-        "unchecked": proof.unchecked,
     }
 
 
@@ -168,38 +160,22 @@ def _print(found: list[tuple[Path, Proof]], original: _Original, losses: list[st
     facts = [_facts(file, proof, original) for file, proof in found]
     if console.mode.quiet:
         for each in facts:
-            what = each["fault"] or (
-                _UNCHECKED if each["unchecked"] else console.fidelity(each["verify_db"])
-            )
+            what = each["fault"] or console.fidelity(each["verify_db"])
             console.out.print(f"{each['file']}: {what}", markup=False)
         return
-    hidden = {"file", "size_bytes", "against", "right", "fault", "unchecked"}
+    hidden = {"file", "size_bytes", "against", "right", "fault"}
     hidden |= {"worst_attribute", "worst_splat"}
     shown = [name for name in dict.fromkeys(chain(*facts)) if name not in hidden]
     rows = [
         (_label(name), *(_figure(name, each.get(name, "-")) for each in facts)) for name in shown
     ]
     rows.append(("worst", *map(_worst, facts)))
-    rows.append(("verdict", *map(_verdict, facts)))
+    rows.append(("verdict", *("wrong" if each["fault"] else "right" for each in facts)))
     console.table(
         ("", *(file.name for file, _ in found)), rows, title=f"Compared with {original.name}"
     )
-    if original.itself and not found[0][1].unchecked:
-        console.note(_ONLY_ITSELF, "dim")
-    for file, proof in found:
-        if proof.unchecked:
-            console.warn(
-                f"Warning: {file.name} {_UNCHECKED}: the second reader does not understand "
-                f"{proof.unchecked}. The first one found the file whole."
-            )
     for loss in losses:
         console.warn(f"Warning: {loss}")
-
-
-def _verdict(facts: dict[str, Any]) -> str:
-    if facts["unchecked"]:
-        return "not cross-checked"
-    return "wrong" if facts["fault"] else "right"
 
 
 def _worst(facts: dict[str, Any]) -> str:
@@ -227,10 +203,6 @@ def _raise_if_wrong(found: list[tuple[Path, Proof]], original: _Original) -> Non
     raise QualityError(
         "verify-failed",
         given="; ".join(f"{file.name} is wrong: {fault}" for file, fault in wrong) + ".",
-        wanted="A file that two readers understand alike."
-        if original.itself
-        else f"The same splats as in {original.name}.",
-        hint="Report this with the file."
-        if original.itself
-        else "Write it again with `splat export` or `splat convert`.",
+        wanted=f"The same splats as in {original.name}.",
+        hint="Write it again with `splat export` or `splat convert`.",
     )

@@ -63,8 +63,6 @@ class Proof:
         fault: why the file is wrong; "" if it is not.
         loss_db: the PSNR of a lossy file where it calls for a warning, else None.
         changes: by attribute in which splats look different.
-        unchecked: what the independent reader does not understand, where the file is its own
-            original; "" if it was compared.
     """
 
     splats: int
@@ -72,7 +70,6 @@ class Proof:
     fault: str = ""
     loss_db: float | None = None
     changes: dict[str, Change] = field(default_factory=dict)
-    unchecked: str = ""
 
 
 def cameras_for(splats: Splats, views: Sequence[View] = ()) -> tuple[Camera, ...]:
@@ -152,20 +149,14 @@ class Prover:
         pairs = zip(plain.pictures, self.pictures, strict=True)
         return float(np.mean([capped_psnr_db(a, np.clip(b, 0.0, 1.0)) for a, b in pairs]))
 
-    def prove(self, path: Path, exact: bool = False) -> Proof:
+    def prove(self, path: Path) -> Proof:
         """Read `path` with an independent reader, draw it and compare. Nothing is raised for a
-        wrong file.
-
-        exact: whether a lossy format has to agree, too, because the original was read from this
-        file.
-        """
+        wrong file."""
         row = format_of(path)
         try:
             content = _drawable(checks.read_back(path))
             errors = checks.CHECKS[row.ending].validate(path)
         except NotCrossCheckedError as error:
-            if exact:
-                return Proof(len(self.splats), {}, unchecked=str(error))
             return Proof(0, {}, f"another reader does not understand {error}")
         except Exception as error:  # whatever the reader raises: the file is wrong
             return Proof(0, {}, f"another reader refused it ({reason_of(error)})")
@@ -175,7 +166,7 @@ class Prover:
         if count != len(self.splats):
             return Proof(count, {}, f"it holds {count} of {len(self.splats)} splats")
         names = tuple(filter(None, (row.ending, self.source_format)))
-        lossy = not exact and any(BY_ENDING[name].loses for name in names)
+        lossy = any(BY_ENDING[name].loses for name in names)
         return self._compared(content, names, lossy)
 
     def _compared(self, content: FileContent, names: tuple[str, ...], lossy: bool) -> Proof:

@@ -162,23 +162,9 @@ def test_a_file_is_compared_with_another_whose_rows_are_sorted_differently(
     assert found["max_log_scale_error"] < 0.1
 
 
-def test_a_file_without_a_run_is_compared_with_itself_and_says_so(
-    scene: SmallScene, tmp_path: Path
-) -> None:
+def test_a_file_without_a_run_and_an_original_is_refused(scene: SmallScene, tmp_path: Path) -> None:
     formats.write(tmp_path / "a.spz", scene.splats)
-    out, err = verified(tmp_path / "a.spz")
-    assert "Compared with itself" in out
-    assert "not shown by this" in err
-    assert "--against" in err
-    assert events(tmp_path / "a.spz")[-1]["against"] == "itself"
-
-
-def test_what_the_second_reader_does_not_understand_is_no_failure() -> None:
-    path = Path(__file__).parents[1] / "formats" / "spz4" / "gsply_degree_2.spz"
-    out, err = verified(path)
-    assert "not cross-checked" in out
-    assert "does not understand SPZ version 4" in " ".join(err.split())
-    assert events(path)[-1]["right"] is None
+    assert "verify-no-original" in verified(tmp_path / "a.spz", code=2)[1]
 
 
 def test_a_visible_loss_is_a_warning_and_no_failure(scene: SmallScene, tmp_path: Path) -> None:
