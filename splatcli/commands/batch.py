@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Annotated, Any
 
 import typer
-from rich.live import Live
-from rich.table import Table
-from rich.text import Text
 
-from splatcli import console, log, options, run_settings
+from splatcli import console, log, options, progress, run_settings
 from splatcli.arguments import Cluster
 from stages.distributed import remote
-from stages.distributed.batch import WAITING, BatchTable, Row, run_names, running_stage
+from stages.distributed.batch import BatchTable, Row, run_names
 from stages.distributed.cluster import open_executor
 from stages.distributed.tasks import TaskResult, resources_of, task_for
 
@@ -50,15 +45,15 @@ def batch(
     runs = remote.parse_location(out)
     photos = run_names(remote.expand_locations(captures))
     tasks = [task_for(remote.joined(runs, name), path, settings) for name, path in photos.items()]
+    bars = progress.Bars() if console.mode.has_notes and console.err.is_terminal else None
     with (
         remote.prepare_output(runs) as local_folder,
-        open_executor(cluster, runs, photos.values()) as executor,
+        open_executor(cluster, runs, photos.values(), bars) as executor,
     ):
         table = BatchTable(local_folder, runs, list(photos))
-        with _live_table(table):
-            for number, result in executor.results(tasks, resources_of(settings["train"])):
-                table.ended(number, result)
-                _report(table.rows[number], result)
+        for number, result in executor.results(tasks, resources_of(settings["train"])):
+            table.ended(number, result)
+            _report(table.rows[number], result)
         table.write()
     _print(table)
     if table.worst_status:
@@ -71,37 +66,9 @@ def _report(row: Row, result: TaskResult) -> None:
         console.emit("ended", **vars(row), exit_status=result.status, message=result.message)
     elif result.status:
         console.note(f"{row.capture}: {result.message} ({result.code})", "red")
-    elif not console.mode.quiet and not console.err.is_terminal:
+    elif not console.mode.quiet:
         seconds = console.duration(float(row.seconds or 0))
         console.note(f"{row.capture}: done in {seconds}, {_db(row)}")
-
-
-@contextmanager
-def _live_table(table: BatchTable) -> Iterator[None]:
-    """On a terminal, show the running stages until all runs have ended."""
-    if not (console.mode.has_notes and console.err.is_terminal):
-        yield
-        return
-    live = Live(
-        get_renderable=lambda: _running(table),
-        console=console.err,
-        refresh_per_second=1,
-        transient=True,
-    )
-    with live:
-        yield
-
-
-def _running(table: BatchTable) -> Table:
-    """The runs that are being worked on; how many wait, are done, or failed."""
-    drawn = Table(title=table.counts(), title_justify="left", box=None, pad_edge=False)
-    for heading in ("capture", "stage", "for"):
-        drawn.add_column(heading)
-    for row in table.rows:
-        running = running_stage(table.folder / row.capture) if row.status == WAITING else None
-        if running is not None:
-            drawn.add_row(Text(row.capture), running[0], console.duration(running[1]))
-    return drawn
 
 
 def _print(table: BatchTable) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import astuple, dataclass, fields, replace
@@ -96,11 +94,6 @@ class BatchTable:
         if isinstance(self.runs, str):
             remote.RemoteFolder.at(self.runs).put(self.folder, [FILE_NAME])
 
-    def counts(self) -> str:
-        """ "2 waiting, 1 done, 1 failed"."""
-        kinds = (row.status if row.status in (WAITING, DONE) else "failed" for row in self.rows)
-        return ", ".join(f"{count} {kind}" for kind, count in Counter(kinds).items())
-
 
 def row_of(run_folder: Path) -> Row:
     """The figures in the manifests of a run folder; blank where one is missing or unreadable."""
@@ -122,12 +115,3 @@ def row_of(run_folder: Path) -> Row:
         sizes = [f["size_bytes"] for f in export.metrics.get("formats", {}).values()]
         row = replace(row, size_bytes=sum(sizes), splats=export.metrics.get("splats", ""))
     return row
-
-
-def running_stage(run_folder: Path) -> tuple[str, float] | None:
-    """(the stage that has a working folder, seconds since that was made), if there is one."""
-    for number, name in enumerate(STAGE_NAMES, start=1):
-        with suppress(OSError):
-            begun = (run_folder / f".{number}-{name}.partial").stat()
-            return name, max(0.0, time.time() - begun.st_ctime)
-    return None
