@@ -80,20 +80,6 @@ def test_what_was_found_before_is_kept_and_the_missing_added(
     assert found(job, "matches") == whole[0]
 
 
-def test_matches_without_a_geometry_are_verified_and_not_matched_again(
-    features: Project, whole: tuple[Rows, Rows], tmp_path: Path
-) -> None:
-    job = matching(features, tmp_path, "exhaustive")
-    jobs.work(job)
-    with closing(sqlite3.connect(job.project.database)) as connection:
-        connection.execute("DELETE FROM two_view_geometries")
-        connection.execute("UPDATE matches SET rows = 0, data = '' WHERE pair_id % 2 = 0")
-        connection.commit()
-    jobs.work(job)
-    for row, before in zip(found(job, "two_view_geometries"), whole[1], strict=True):
-        assert row[1] == (0 if int(str(row[0])) % 2 == 0 else before[1])
-
-
 def test_photographs_without_features_match_nothing(features: Project, tmp_path: Path) -> None:
     job = matching(features, tmp_path, "auto")
     with closing(sqlite3.connect(job.project.database)) as connection:
