@@ -26,12 +26,13 @@ from PIL import Image, ImageCms, ImageFile, UnidentifiedImageError
 from stages.base.text import reason_of
 from stages.ingest import colour
 from stages.ingest.exif import Exif, read_exif
+from stages.ingest.tiff import is_negative, tiff_fault
 from stages.scene import fitted_size
 
 MAX_MEGAPIXELS = 200
 MAX_FILE_BYTES = 2**31
 COPY_AGAIN = "Copy it from the camera again"
-EIGHT_OR_SIXTEEN_BITS = "Save it with 8 or 16 bits a sample"
+EIGHT_OR_SIXTEEN_BITS = "Save it with 8 or 16 bits a sample, channels interleaved"
 AS_JPEG = "Save it as JPEG or PNG if it belongs to the capture"
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "HEIF", "AVIF", "BMP")  # MPO opens as JPEG
 _SMALLEST_SIDE_PX = 16
@@ -217,6 +218,9 @@ def _declared_space(exif: Exif, info: dict[Any, Any]) -> Any:
 
 def _loaded(image: Image.Image, data: bytes) -> Image.Image:
     """The decoded picture with 8 bits a sample. Raises what Pillow and OpenCV raise."""
+    tags = getattr(image, "tag_v2", {})
+    if fault := tiff_fault(tags):
+        raise Unusable(fault, EIGHT_OR_SIXTEEN_BITS)
     try:
         image.load()
     except OSError:
@@ -227,7 +231,7 @@ def _loaded(image: Image.Image, data: bytes) -> Image.Image:
         samples = np.asarray(image).astype(np.int64)
         if samples.min() < 0 or samples.max() > 65535:
             raise Unusable("its samples have more than 16 bits", EIGHT_OR_SIXTEEN_BITS)
-        return Image.fromarray(_to_8_bit(samples))
+        return Image.fromarray(_to_8_bit(65535 - samples if is_negative(tags) else samples))
     if image.mode == "F":
         raise Unusable("its samples are floating-point numbers", EIGHT_OR_SIXTEEN_BITS)
     return image
