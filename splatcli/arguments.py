@@ -38,6 +38,9 @@ Out = Annotated[
         rich_help_panel="Output",
     ),
 ]
+NoClobber = Annotated[
+    bool, typer.Option("--no-clobber", help="Refuse to replace a file.", rich_help_panel="Output")
+]
 Cluster = Annotated[
     str | None,
     typer.Option(

@@ -9,13 +9,13 @@ from typing import Annotated, Any
 import typer
 
 from splatcli import console
-from splatcli.arguments import ENDINGS
+from splatcli.arguments import ENDINGS, NoClobber
 from stages import formats
 from stages.base import scratch
 from stages.base.atomic import make_folder
 from stages.base.errors import UsageError
 from stages.formats import format_of
-from stages.formats.replacement import replacing_asset
+from stages.formats.replacement import check_target, replacing_asset
 from stages.formats.values import nothing_drawable
 from stages.proof.losses import require_proven
 from stages.proof.prover import Prover, cameras_for
@@ -28,12 +28,15 @@ _STEPS = 3
 def convert(
     source: Annotated[Path, typer.Argument(help="Splat file to read; its name says the format.")],
     target: Annotated[Path, typer.Argument(help=f"Splat file to write: {ENDINGS}.")],
+    *,
+    no_clobber: NoClobber = False,
 ) -> None:
     """Write a splat file in another format.
 
     The new file is read with a second parser, drawn and compared with the first.
     """
     rows = formats.format_of(source), formats.format_of(target)  # before any work is done
+    check_target(target, no_clobber, source)
     begun = time.monotonic()
     # the folder of the target is made once there is something to write
     nearest = next(folder for folder in target.absolute().parents if folder.is_dir())

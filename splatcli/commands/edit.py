@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from splatcli import console
-from splatcli.arguments import ENDINGS
+from splatcli.arguments import ENDINGS, NoClobber
 from splatcli.folders import load_target
 from splatcli.operation_options import parsed_operations
 from stages import formats
@@ -23,7 +23,7 @@ from stages.editing.scene import EditedScene
 from stages.editing.syntax import ParsedOperation
 from stages.evaluate.evaluation import load_evaluation_views
 from stages.formats import format_of, units_of
-from stages.formats.replacement import replacing_asset
+from stages.formats.replacement import check_target, replacing_asset
 from stages.formats.values import drop_undrawable, nothing_drawable
 from stages.proof.losses import require_proven
 from stages.proof.prover import Prover, cameras_for
@@ -42,6 +42,7 @@ def edit(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Print the effect of the operations; write nothing.")
     ] = False,
+    no_clobber: NoClobber = False,
     **operation_options: Any,
 ) -> None:
     """Select, move, join and thin out splats: operations in the order in which they are typed.
@@ -57,6 +58,8 @@ def edit(
             wanted="A second file name, or --dry-run.",
             hint=f"splat edit {source} edited.ply --keep 'opacity > 0.1'",
         )
+    if target is not None and not dry_run:
+        check_target(target, no_clobber)
     parsed = parsed_operations(ctx)
     facts = _edit(source, target or Path("scene.ply"), parsed, dry_run)
     if console.mode.as_json:

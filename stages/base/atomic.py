@@ -8,6 +8,7 @@ import os
 import platform
 import re
 import shutil
+import tempfile
 import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -66,6 +67,16 @@ def replacing(path: Path) -> Iterator[Path]:
         # An error here must not hide the one that is being raised.
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def temporary_beside(path: Path) -> Iterator[Path]:
+    """Yield a path that ends as `path` does, folder and name, in a temporary folder beside it,
+    which is removed when the block ends."""
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=partial_prefix()) as name:
+        folder = Path(name) / path.absolute().parent.name
+        folder.mkdir(exist_ok=True)
+        yield folder / path.name
 
 
 def _temporary_name(name: str) -> str:

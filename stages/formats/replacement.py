@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from stages.base.atomic import partial_prefix, remove_abandoned_files, sync_folder
+from stages.base.atomic import remove_abandoned_files, sync_folder, temporary_beside
+from stages.base.errors import UsageError
+from stages.formats import streamed_sog
 from stages.formats.format_table import format_of
 from stages.formats.offset import offset_path
 
@@ -16,21 +17,38 @@ from stages.formats.offset import offset_path
 @contextmanager
 def replacing_asset(path: Path) -> Iterator[Path]:
     """Yield a path of the same name in a temporary folder beside `path`; what was written there
-    replaces the asset at `path` when the block ends. If the block raises, nothing is replaced.
-
-    A streamed asset is written in its place, because its writer replaces the earlier one.
-    """
+    replaces the asset at `path` when the block ends. If the block raises, nothing is replaced."""
     row = format_of(path)
-    if row.streamed:
-        yield path
-        return
     remove_abandoned_files(path.parent)
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=partial_prefix()) as folder:
-        temporary = Path(folder) / path.name
+    with temporary_beside(path) as temporary:
         yield temporary
+        if row.streamed:
+            return streamed_sog.move(temporary, path)
         beside = offset_path(temporary)
         if not row.holds_origin and not beside.exists():
             offset_path(path).unlink(missing_ok=True)
-        for file in sorted(Path(folder).iterdir(), key=lambda file: file == temporary):
+        for file in sorted(temporary.parent.iterdir(), key=lambda file: file == temporary):
             os.replace(file, path.with_name(file.name))
         sync_folder(path.parent)
+
+
+def check_target(path: Path, no_clobber: bool, source: Path | None = None) -> None:
+    """Raise SplatError for a file that must not be written: "target-is-source" for `source`,
+    "target-exists" with `no_clobber` if it, or a file that belongs to it, exists."""
+    row = format_of(path)
+    if source and path.exists() and source.exists() and path.samefile(source):
+        raise UsageError(
+            "target-is-source",
+            given=f"{path} is the file that is read.",
+            wanted="Another name: the values of a file are not the same once they are converted.",
+            hint=f"For example {path.with_name('new-' + path.name)}",
+        )
+    sidecar = path.with_suffix(row.sidecar) if row.sidecar else path
+    for file in (path, sidecar, path if row.holds_origin else offset_path(path)):
+        if no_clobber and os.path.lexists(file):
+            raise UsageError(
+                "target-exists",
+                given=f"{file} exists.",
+                wanted="A new name, because of --no-clobber.",
+                hint="Name another file, or leave --no-clobber away.",
+            )

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.atomic import make_folder, partial_prefix, replacing
+from stages.base.atomic import make_folder, replacing, temporary_beside
 from stages.base.bad_files import BadFileError, reading
 from stages.base.blocks import blocks
 from stages.base.errors import UsageError
@@ -88,27 +88,33 @@ def write(
     levels = [splats, *coarser]
     make_folder(path.parent)
     tree = _cut(levels)
-    partial = path.with_name(partial_prefix() + "chunks")
-    folders: list[Path] = []
+    with temporary_beside(path) as asset:
+        names = _write_chunks(asset.parent, list(_leaves(tree)), levels, units)
+        meta = _meta(tree, levels, names, units)
+        asset.write_text(json.dumps(meta, allow_nan=False), encoding="utf-8")
+        html.write_beside(asset, splats, units, views, splat_widths(asset, splats))
+        move(asset, path)
+
+
+def move(asset: Path, path: Path) -> None:
+    """Move a new asset to `path`; see `write`. Raises SplatError as it does."""
+    _refuse_taken(path.with_suffix(".html"))
+    meta, earlier = json.loads(asset.read_text(encoding="utf-8")), _chunk_folders(path)
+    folders = _free_folders(path, meta["filenames"])
     try:
-        make_folder(partial)
-        names = _write_chunks(partial, list(_leaves(tree)), levels, units)
-        folders = _free_folders(path, names)
-        meta = _meta(tree, levels, [f"{new.name}/meta.json" for new in folders], units)
-        earlier = _chunk_folders(path)
         with replacing(path) as temporary:
-            temporary.write_text(json.dumps(meta, allow_nan=False), encoding="utf-8")
-            for name, new in zip(names, folders, strict=True):
-                (partial / name).parent.rename(new)
+            names = [f"{folder.name}/meta.json" for folder in folders]
+            moved = json.dumps(meta | {"filenames": names}, allow_nan=False)
+            temporary.write_text(moved, encoding="utf-8")
+            for name, folder in zip(meta["filenames"], folders, strict=True):
+                (asset.parent / name).parent.rename(folder)
     except BaseException:
-        for new in set(folders) - _chunk_folders(path):
-            shutil.rmtree(new, ignore_errors=True)
+        for folder in set(folders) - _chunk_folders(path):
+            shutil.rmtree(folder, ignore_errors=True)
         raise
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     for old in earlier:
         _remove_chunk(old)
-    html.write_beside(path, splats, units, views, splat_widths(path, splats))
+    os.replace(asset.with_suffix(".html"), path.with_suffix(".html"))
 
 
 def _meta(tree: _Tree, levels: Sequence[Splats], names: list[str], units: str) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from splatcli.app import app
 from stages import formats
 from stages.base import scratch
 from stages.formats.mesh_table import MESHES
+from stages.proof import checks
 from tests.cli.help_text import help_of
 from tests.formats.truth import many_splats
 
@@ -237,6 +238,46 @@ def test_an_unusual_name_of_a_file_is_written_and_read(tmp_path: Path, name: str
     converted(tmp_path / "a.ply", tmp_path / name)
     converted(tmp_path / name, tmp_path / "back.ply")
     assert len(formats.read(tmp_path / "back.ply")) == 20
+
+
+def test_a_file_is_not_converted_onto_itself(tmp_path: Path) -> None:
+    formats.write(tmp_path / "a.ply", many_splats(20))
+    before = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "link.ply").symlink_to(tmp_path / "a.ply")
+    for target in ("a.ply", "link.ply"):
+        assert "target-is-source" in converted(tmp_path / "a.ply", tmp_path / target, code=2)[1]
+    assert (tmp_path / "a.ply").read_bytes() == before
+
+
+@pytest.mark.parametrize("command", [["convert"], ["edit", "--scale", "2"]])
+@pytest.mark.parametrize(
+    ("taken", "target"),
+    [("b.spz", "b.spz"), ("b.bin", "b.gltf"), ("lod-meta.html", "lod-meta.json")],
+)
+def test_no_clobber_refuses_to_replace_a_file(
+    tmp_path: Path, command: list[str], taken: str, target: str
+) -> None:
+    formats.write(tmp_path / "a.ply", many_splats(20))
+    (tmp_path / taken).write_text("mine")
+    words = [command[0], str(tmp_path / "a.ply"), str(tmp_path / target), *command[1:]]
+    result = CliRunner().invoke(app, [*words, "--no-clobber"])
+    assert result.exit_code == 2, result.stderr
+    assert "target-exists" in result.stderr
+    assert (tmp_path / taken).read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", ["b.gltf", "lod-meta.json"])
+def test_a_conversion_that_fails_its_check_leaves_the_earlier_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    formats.write(tmp_path / "a.ply", many_splats(20))
+    converted(tmp_path / "a.ply", tmp_path / name)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.*")}
+    formats.write(tmp_path / "a.ply", many_splats(30))
+    before[tmp_path / "a.ply"] = (tmp_path / "a.ply").read_bytes()
+    monkeypatch.setattr(checks, "read_back", lambda path: 1 / 0)
+    assert "convert-verify-failed" in converted(tmp_path / "a.ply", tmp_path / name, code=7)[1]
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.*")} == before
 
 
 def test_help_names_every_ending() -> None:
