@@ -11,10 +11,13 @@ from __future__ import annotations
 import os
 import secrets
 import shutil
+import socket
 import sys
 import threading
+import time
 import webbrowser
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -25,7 +28,8 @@ from urllib.parse import parse_qsl
 
 LOOPBACK = "127.0.0.1"
 MOST_CONNECTIONS = 64  # each has a thread; a browser opens six at a time
-TIMEOUT_S = 20.0  # for a client to send its request, or to take 64 kB of the response
+TIMEOUT_S = 20.0  # for a client to send its whole request, or to take 64 kB of the response
+ANSWER_S = 600.0  # for a client to take the whole response
 
 
 @dataclass(frozen=True)
@@ -64,6 +68,7 @@ class LocalServer(ThreadingHTTPServer):
         self.root = f"/{secrets.token_urlsafe(16)}"
         self.items = {self.root + address: item for address, item in items.items()}
         self._free = threading.BoundedSemaphore(MOST_CONNECTIONS)
+        self.ends: dict[Any, float] = {}  # when each connection is ended, by `time.monotonic`
         super().__init__((LOOPBACK, port), _Handler)
 
     @property
@@ -74,6 +79,7 @@ class LocalServer(ThreadingHTTPServer):
     def process_request(self, request: Any, client_address: Any) -> None:
         """Answer in a thread of its own, if one is free."""
         if self._free.acquire(blocking=False):
+            self.ends[request] = time.monotonic() + TIMEOUT_S
             super().process_request(request, client_address)
         else:
             self.shutdown_request(request)
@@ -83,7 +89,17 @@ class LocalServer(ThreadingHTTPServer):
         try:
             super().process_request_thread(request, client_address)
         finally:
+            del self.ends[request]
             self._free.release()
+
+    def service_actions(self) -> None:
+        """End the connections of clients that take too long: one that sends a byte now and then
+        would keep its thread for ever. `serve_forever` calls this twice a second."""
+        now = time.monotonic()
+        for request, end in list(self.ends.items()):
+            if now > end:
+                with suppress(OSError):  # it ended by itself
+                    request.shutdown(socket.SHUT_RDWR)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Print nothing when a browser closes the connection early."""
@@ -100,6 +116,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer(with_body=False)
 
     def _answer(self, *, with_body: bool) -> None:
+        self.server.ends[self.connection] = time.monotonic() + ANSWER_S
         path, _, query = self.path.partition("?")
         try:
             item = self.server.items[path]

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import socket
 import threading
+import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -107,6 +109,22 @@ def test_idle_connections_are_bounded_in_number_and_time(
     for client in idle:
         client.close()
     assert ask(server, "/")[0] == 200
+
+
+def test_a_request_that_comes_byte_by_byte_does_not_keep_others_out(
+    server: LocalServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("stages.viewer.server.TIMEOUT_S", 1.5)
+    address = ("127.0.0.1", server.server_port)
+    slow = [socket.create_connection(address, timeout=10) for _ in range(MOST_CONNECTIONS)]
+    for _ in range(20):  # 4 s, of which none passes without a byte
+        for client in slow:
+            with suppress(OSError):
+                client.sendall(b"G")
+        time.sleep(0.2)
+    assert ask(server, "/")[0] == 200
+    for client in slow:
+        client.close()
 
 
 def test_a_port_that_is_taken_is_refused() -> None:
