@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from inspect import Parameter
 from itertools import chain
 from typing import Annotated, Any
@@ -20,6 +21,7 @@ from splatcli import run_settings
 from splatcli.arguments import AS_JSON, QUIET, VERBOSE
 from splatcli.command_group import CommandGroup
 from splatcli.console import guarded
+from splatcli.help import HelpedCommand
 from splatcli.operation_options import OrderedCommand, operation_parameters
 from splatcli.options import parameters, with_parameters
 from splatcli.render_options import RenderOptions
@@ -41,17 +43,20 @@ class Entry:
         added: parameters besides those of its function.
         options: () -> more parameters, made when the command is used.
         kind: of the command.
+        panel: the heading under which `splat --help` lists it.
     """
 
     help: str
     example: str
     added: tuple[Parameter, ...] = ()
     options: Callable[[], Iterable[Parameter]] = tuple
-    kind: type[TyperCommand] = TyperCommand
+    kind: type[TyperCommand] = HelpedCommand
+    panel: str = "Scenes"
 
 
 def _stage(name: str, help: str, example: str) -> Entry:
-    return Entry(help, example, _RUN, lambda: run_settings.stage_parameters(name))
+    parameters = partial(run_settings.stage_parameters, name)
+    return Entry(help, example, _RUN, parameters, panel="One stage of a run")
 
 
 ENTRIES = {
@@ -94,50 +99,67 @@ ENTRIES = {
         _RESULT,
         operation_parameters,
         OrderedCommand,
+        panel="Files",
     ),
     "status": Entry(
-        "Say what is finished, what would run again, and why.", "splat status run/", (AS_JSON,)
+        "Say what is finished, what would run again, and why.",
+        "splat status run/",
+        (AS_JSON,),
+        panel="Look and measure",
     ),
     "render": Entry(
         "Draw the splats: from a photograph's camera, or as a film along a path.",
         "splat render run/ --path orbit --out film.mp4",
         _RESULT,
         lambda: parameters(RenderOptions),
+        panel="Look and measure",
     ),
     "view": Entry(
         "Show the splats in a browser: orbit, fly, stand where the photographs were taken.",
         "splat view run/",
+        panel="Look and measure",
     ),
     "info": Entry(
         "Print statistics of a file or a run: splats, SH degrees, bounds, bytes, and warnings.",
         "splat info run/7-export/scene.ply",
         (AS_JSON,),
+        panel="Look and measure",
     ),
     "tradeoff": Entry(
         "Measure quality against time, bytes and number of splats: a report with plots.",
         "splat tradeoff run/",
         _RESULT,
+        panel="Look and measure",
     ),
     "compare": Entry(
         "Compare two runs: better, worse, or inconclusive.",
         "splat compare run/ other-run/",
         _RESULT,
+        panel="Look and measure",
     ),
     "convert": Entry(
-        "Write a splat file in another format.", "splat convert scene.ply scene.sog", _RESULT
+        "Write a splat file in another format.",
+        "splat convert scene.ply scene.sog",
+        _RESULT,
+        panel="Files",
     ),
     "verify": Entry(
         "Verify a file: read it with a second parser, draw it, compare it with what was trained.",
         "splat verify run/7-export/scene.glb",
         _RESULT,
+        panel="Files",
     ),
     "cameras": Entry(
         "Write cameras for other programs: those of a run, of nerfstudio or of COLMAP.",
         "splat cameras run/ transforms.json",
         (AS_JSON,),
+        panel="Files",
     ),
     "doctor": Entry(
-        "Check what this machine has, and what is missing.", "splat doctor", (AS_JSON,)
+        "Check what this machine has, and what is missing.",
+        "splat doctor",
+        (AS_JSON,),
+        panel="This machine",
     ),
 }
 
@@ -166,7 +188,7 @@ class _Commands(CommandGroup):
     def __init__(self, **given: Any) -> None:
         super().__init__(**given)
         self.commands = {
-            name: TyperCommand(name, help=entry.help, rich_markup_mode="rich")
+            name: TyperCommand(name, help=entry.help, rich_help_panel=entry.panel)
             for name, entry in ENTRIES.items()
         }
 

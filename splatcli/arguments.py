@@ -33,6 +33,7 @@ Out = Annotated[
     typer.Option(
         "--out",
         "-o",
+        metavar="PATH",
         help="Run folder to make or continue.",
         show_default="run",
         rich_help_panel="Output",

@@ -10,6 +10,7 @@ import typer
 from typer.core import TyperGroup
 
 from splatcli import console
+from splatcli.help import print_help
 from stages.base.errors import Family, SplatError, UsageError
 
 _UsageError: Any = typer.BadParameter.__base__  # typer does not export it
@@ -17,6 +18,10 @@ _UsageError: Any = typer.BadParameter.__base__  # typer does not export it
 
 class CommandGroup(TyperGroup):
     """The commands. The parser's errors become `SplatError` "command-line"."""
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Print the help; `formatter` is not needed."""
+        print_help(self, ctx)
 
     def main(
         self,

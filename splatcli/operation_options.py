@@ -6,15 +6,15 @@ from inspect import Parameter
 from typing import Any
 
 import typer
-from typer.core import TyperCommand
 
+from splatcli.help import HelpedCommand
 from splatcli.options import keyword
 from stages.editing.syntax import OPERATIONS, ParsedOperation
 
 _ORDER = "splat.order"  # the key of (option, value) pairs in the context's `meta`
 
 
-class OrderedCommand(TyperCommand):
+class OrderedCommand(HelpedCommand):
     """A command that keeps the order of its options: the parser groups their values by option."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from rich.console import RenderableType
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -16,6 +17,7 @@ from rich.progress import (
     TextColumn,
     TimeRemainingColumn,
 )
+from rich.table import Column
 from rich.text import Text
 
 from splatcli import console
@@ -25,6 +27,7 @@ from stages.run.manifest import Manifest, plain
 
 _LINE_EVERY_S = 10.0
 _EVENT_EVERY_S = 0.5
+_LABEL_WIDTH = 24
 _COUNTED = ("photographs", "pairs")
 STOPPING = "Stopping at the next safe place (Ctrl-C again stops at once)."
 
@@ -163,21 +166,33 @@ class _Rate(ProgressColumn):
         return Text(_rate(speed) if speed else "", style="dim")
 
 
-def _bar(
-    *first: ProgressColumn, last: Sequence[ProgressColumn] = (), disable: bool = False
-) -> Progress:
-    """A bar on standard error, between its first and its last columns."""
-    return Progress(
-        *first,
-        BarColumn(bar_width=24),
-        MofNCompleteColumn(),
-        _Rate(),
-        TimeRemainingColumn(compact=True),
-        *last,
-        console=console.err,
-        transient=True,
-        disable=disable,
-    )
+def _whole() -> Column:
+    """A column that is never cut nor wrapped."""
+    return Column(no_wrap=True)
+
+
+class _Bar(Progress):
+    """A bar on standard error as wide as the terminal, its figures in a line below: beside it they
+    would leave no room for the count, the rate and the time left."""
+
+    def __init__(self, *first: ProgressColumn, disable: bool = False) -> None:
+        super().__init__(
+            *first,
+            BarColumn(bar_width=None, table_column=Column(ratio=1)),
+            MofNCompleteColumn(table_column=_whole()),
+            _Rate(table_column=_whole()),
+            TimeRemainingColumn(compact=True, table_column=_whole()),
+            console=console.err,
+            transient=True,
+            disable=disable,
+            expand=True,
+        )
+
+    def get_renderables(self) -> Iterator[RenderableType]:
+        yield from super().get_renderables()
+        for task in self.tasks:
+            if figures := task.fields.get("figures"):
+                yield Text(f"    {figures}", style="cyan", no_wrap=True, overflow="ellipsis")
 
 
 class Bars(Quiet):
@@ -190,10 +205,13 @@ class Bars(Quiet):
     def started(self, stage: Stage, number: int, reason: str, resumed: bool) -> None:
         self._close()
         self._timer = _PhaseTimer()
-        self._progress = _bar(
-            TextColumn(f"[bold]{number}/7 {stage.name:<8}[/bold]"),
-            TextColumn("{task.description}", markup=False),
-            last=[TextColumn("{task.fields[figures]}", markup=False, style="cyan")],
+        self._progress = _Bar(
+            TextColumn(f"[bold]{number}/7 {stage.name:<8}[/bold]", table_column=_whole()),
+            TextColumn(
+                "{task.description}",
+                markup=False,
+                table_column=Column(no_wrap=True, overflow="ellipsis", max_width=_LABEL_WIDTH),
+            ),
         )
         waiting = "going on" if resumed else "starting"
         self._task = self._progress.add_task(waiting, total=None, figures="")
@@ -236,7 +254,7 @@ def counting(what: str, total: int) -> Iterator[Callable[[], None]]:
     remaining time. One item is not worth a count, but for machines."""
     done, last, timer, mode = 0, time.monotonic(), _PhaseTimer(), console.mode
     shown = mode.has_notes and total > 1
-    bar = _bar(TextColumn(what), disable=not (shown and console.err.is_terminal))
+    bar = _Bar(TextColumn(what), disable=not (shown and console.err.is_terminal))
     task = bar.add_task(what, total=total)
     timer.new_phase(0, total)
 

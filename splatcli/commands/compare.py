@@ -27,9 +27,9 @@ from stages.tradeoff.comparison import (
 def compare(
     first: Annotated[Path, typer.Argument(help="Run folder.")],
     second: Annotated[Path, typer.Argument(help="Another, of the same photographs.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the report.")] = Path(
-        "comparison"
-    ),
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="PATH", help="Folder for the report.")
+    ] = Path("comparison"),
 ) -> None:
     """Compare two runs: better, worse, or inconclusive.
 

@@ -37,7 +37,9 @@ def render(
     *,
     out: Annotated[
         Path,
-        typer.Option("--out", "-o", help="Picture (.png), film (.mp4) or folder of frames."),
+        typer.Option(
+            "--out", "-o", metavar="PATH", help="Picture (.png), film (.mp4) or folder of frames."
+        ),
     ] = Path("view.png"),
     backend: Backend = None,
     **given: Any,

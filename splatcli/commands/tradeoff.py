@@ -27,7 +27,13 @@ def tradeoff(
     run: Run = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Folder for the report.", show_default="RUN/tradeoff"),
+        typer.Option(
+            "--out",
+            "-o",
+            metavar="PATH",
+            help="Folder for the report.",
+            show_default="RUN/tradeoff",
+        ),
     ] = None,
 ) -> None:
     """Measure quality against time, bytes and number of splats: a report with plots.

@@ -47,7 +47,8 @@ def verify(
     against: Annotated[
         Path | None,
         typer.Option(
-            help="Run folder or splat file that it must equal; by default the run around it."
+            metavar="PATH",
+            help="Run folder or splat file that it must equal; by default the run around it.",
         ),
     ] = None,
 ) -> None:

@@ -48,7 +48,8 @@ def view(
         Path | None,
         _of_page(
             "Write a page for a client (.html), in place of showing one: no panel, no file names; "
-            "it opens from disk."
+            "it opens from disk.",
+            metavar="PATH",
         ),
     ] = None,
     camera: Annotated[

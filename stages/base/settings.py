@@ -32,7 +32,7 @@ from stages.base.errors import SplatError, UsageError
 
 PANELS = (
     *("Input", "Quality and time", "Size", "Output"),
-    *("Known cameras", "Light and masks", "Advanced"),
+    *("Known cameras", "Units", "Light and masks", "Advanced"),
 )
 
 

@@ -64,20 +64,20 @@ class SfmSettings:
     metres: bool = setting(
         False,
         "The poses of --cameras are in metres, as those of phones' AR sessions are.",
-        panel="Known cameras",
+        panel="Units",
         needs="cameras",
     )
     scale: tuple[str, ...] = setting(
         (),
         "Two photographs and the distance between their cameras (metres).",
-        panel="Known cameras",
+        panel="Units",
         together="A B METRES",
     )
     marker: float = setting(
         0.0,
         "Side of the ArUco markers in the scene, alone or on a ChArUco board "
         "(metres); 0: there are none.",
-        panel="Known cameras",
+        panel="Units",
         min=0.0,
         max=1000.0,
     )
@@ -85,7 +85,7 @@ class SfmSettings:
         "",
         "Turn a scene with GPS to this grid: a projected coordinate reference system in metres, "
         "such as EPSG:25832.",
-        panel="Known cameras",
+        panel="Units",
         pattern=r"(EPSG:[0-9]{4,6})?",
         wanted="An EPSG code, such as EPSG:25832.",
     )

@@ -61,7 +61,7 @@ def test_help_of_train_says_what_a_run_that_goes_on_keeps() -> None:
     text = " ".join(help_of("train").split())
     assert "as before, else standard" in text
     assert "as before, else by preset" in text
-    assert "in training (pixels). [default: (by preset)]" in " ".join(help_of("process").split())
+    assert "in training (pixels). [default: by preset]" in " ".join(help_of("process").split())
 
 
 def _cpu_s(code: str, *arguments: str) -> float:
@@ -127,10 +127,37 @@ def test_process_has_the_promised_options() -> None:
         assert flag in text, flag
 
 
+@pytest.mark.parametrize("command", [None, *COMMANDS])
+def test_help_of_80_columns_cuts_nothing(command: str | None) -> None:
+    words = [command, "--help"] if command else ["--help"]
+    text = CliRunner(env={"COLUMNS": "80", "TERM": "dumb"}).invoke(app, words).output
+    assert max(map(len, text.splitlines())) <= 80
+    assert not re.search("\u2026|<\\w+>|: \\(", text)
+    for parameter in loaded(command).params if command else ():
+        for name in (*parameter.opts, *parameter.secondary_opts):
+            named = name.upper() if not name.startswith("-") else name
+            assert re.search(rf"{re.escape(named)}(?![\\w-])", text), name
+
+
+def test_the_list_of_commands_has_groups_and_process_a_panel_of_units() -> None:
+    found = re.findall(r"─ (.+?) ─+╮", help_of())
+    assert found == [
+        "Options",
+        "Scenes",
+        "One stage of a run",
+        "Files",
+        "Look and measure",
+        "This machine",
+    ]
+    text = help_of("process")
+    units = text[text.index("─ Units ─") : text.index("─ Light and masks ─")]
+    assert all(flag in units for flag in ("--metres", "--scale", "--marker", "--crs"))
+
+
 def test_process_groups_its_options_and_lists_the_common_ones_first() -> None:
     text = help_of("process")
     found = re.findall(r"─ (.+?) ─+╮", text)
-    assert found == ["Arguments", "Options", *PANELS]
+    assert found == ["Arguments", *PANELS, "Options"]
     between = text[text.index("Quality and time") : text.index("─ Size ─")]
     assert all(flag in between for flag in ("--preset", "--steps", "--train-side"))
     assert text.index("--preset") < text.index("--cameras") < text.index("--backend")

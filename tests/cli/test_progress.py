@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import io
+import re
 import time
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from rich.console import Console
 
 from splatcli import console, progress
 
@@ -65,3 +68,27 @@ def test_slow_units_are_seconds_each(clock, lines) -> None:
     clock.s += 30
     listener.progressed(STAGE, "matching", 2, 3, {})
     assert lines[-1] == "  matching: 2/3, 15.0 s each, 15.0 s left"
+
+
+@pytest.mark.parametrize("width", [80, 200])
+def test_the_bar_of_training_shows_step_pace_and_time_left_at_any_width(
+    width: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    screen = Console(file=io.StringIO(), force_terminal=True, width=width, color_system=None)
+    monkeypatch.setattr(console, "err", screen)
+    listener = progress.Bars()
+    listener.started(STAGE, 4, "has not run yet", False)
+    numbers = {"splats": 46913, "loss": 0.0123, "held_out_psnr_db": 27.11, "ssim": 0.8776}
+    for step in (0, 100, 300):
+        listener.progressed(STAGE, "training a long_name_of_a_photograph.jpg", step, 2000, numbers)
+        time.sleep(0.02)
+    drawn = listener._progress
+    assert drawn is not None
+    plain = Console(file=io.StringIO(), width=width)
+    plain.print(drawn.get_renderable())
+    first, second = plain.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    assert re.search(r"4/7 train +training a long.* 300/2000 .*\d/s \d+:\d\d$", first.rstrip())
+    assert "splats 46,913" in second
+    assert "held out PSNR 27.11 dB" in second
+    assert max(len(first), len(second)) <= width
+    listener.ended()
