@@ -35,7 +35,7 @@ Out = Annotated[
         "-o",
         metavar="PATH",
         help="Run folder to make or continue.",
-        show_default="run",
+        show_default="run, or run-PHOTOS beside a run of others",
         rich_help_panel="Output",
     ),
 ]

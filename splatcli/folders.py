@@ -13,6 +13,21 @@ from stages.scene import Splats
 DEFAULT = Path("run")
 
 
+def run_folder_for(photos: Path) -> Path:
+    """Where a run of `photos` belongs without --out: `run/`, or `run-NAME` with the photographs'
+    name beside a `run/` that was made from others. Raises SplatError."""
+    if not (photos.exists() and runfolder.is_run_folder(DEFAULT)):
+        return DEFAULT
+    pipeline, photos = Pipeline(DEFAULT), photos.absolute()
+    try:
+        runfolder.recorded_for(DEFAULT, photos, pipeline.stage_folder("ingest"))
+    except SplatError as error:
+        if error.code != "run-folder-other-photographs":
+            raise
+        return DEFAULT.with_name(f"{DEFAULT}-{photos.stem}")
+    return DEFAULT
+
+
 def find_run_folder(named: Path | None = None) -> Path:
     """The named run folder; else the current folder, `run/`, or the only run folder in the current
     folder. Run folders without a finished stage count only if there is no other.

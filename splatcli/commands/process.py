@@ -8,7 +8,7 @@ from typing import Any
 
 from splatcli import console, log, options, progress, run_result, run_settings
 from splatcli.arguments import Cluster, Out, Photos, Run
-from splatcli.folders import DEFAULT, find_run_folder
+from splatcli.folders import DEFAULT, find_run_folder, run_folder_for
 from stages.base.errors import UsageError
 from stages.base.settings import changed
 from stages.cameras.camera_formats import read_cameras
@@ -67,8 +67,8 @@ def stage_command(name: str) -> Callable[..., None]:
 def _run_folder_and_photos(photos: Path | None, out: Path | None) -> tuple[Path, Path | None]:
     """(run folder, photographs or None) of a command's arguments.
 
-    Photographs start or continue the run folder `out`, or `run/`; a run folder in their place, or
-    nothing, continues with the recorded settings. Raises SplatError.
+    Photographs start or continue the run folder `out`, or `run_folder_for` them; a run folder in
+    their place, or nothing, continues with the recorded settings. Raises SplatError.
     """
     if photos is None:
         return find_run_folder(out), None
@@ -81,7 +81,10 @@ def _run_folder_and_photos(photos: Path | None, out: Path | None) -> tuple[Path,
                 hint=f"Leave --out away to continue {photos}.",
             )
         return photos, None
-    return out or DEFAULT, photos
+    folder = out or run_folder_for(photos)
+    if out is None and folder != DEFAULT and console.mode.has_notes:
+        console.note(f"Run folder: {folder}, since {DEFAULT} holds a run of other photographs.")
+    return folder, photos
 
 
 def _run_stage(name: str, pipeline: Pipeline, given: Mapping[str, Any]) -> None:

@@ -54,6 +54,23 @@ def test_process_writes_every_asset_and_prints_the_paths(splat) -> None:
     assert "Do it yourself" in result.stderr
 
 
+def test_a_second_capture_beside_run_gets_a_folder_of_its_own_name(splat, tmp_path) -> None:
+    other = tmp_path / "oak chair"
+    other.mkdir()
+    (other / "b.jpg").write_bytes(b"another photograph")
+    first = splat("process", "photos")
+    assert str(Path("run/7-export/out.ply")) in first.stdout
+    second = splat("process", "oak chair")
+    assert second.exit_code == 0, second.output
+    assert str(Path("run-oak chair/7-export/out.ply")) in second.stdout
+    assert "run holds a run of other photographs" in second.stderr
+    again = splat("process", "oak chair", "--json")
+    assert (again.exit_code, started(again)) == (0, [])
+    assert started(splat("process", "photos", "--json")) == []
+    assert splat("process", "nope").exit_code == 3
+    assert splat("process", "oak chair", "--out", "run").exit_code == 5
+
+
 def test_warnings_are_repeated_at_the_end(splat) -> None:
     splat("process", "photos")
     result = splat("process", "photos")  # nothing runs
