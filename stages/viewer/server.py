@@ -94,7 +94,7 @@ class LocalServer(ThreadingHTTPServer):
 
     def service_actions(self) -> None:
         """End the connections of clients that take too long: one that sends a byte now and then
-        would keep its thread for ever. `serve_forever` calls this twice a second."""
+        would keep its thread for ever. The server calls this twice a second."""
         now = time.monotonic()
         for request, end in list(self.ends.items()):
             if now > end:

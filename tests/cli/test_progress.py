@@ -78,7 +78,12 @@ def test_the_bar_of_training_shows_step_pace_and_time_left_at_any_width(
     monkeypatch.setattr(console, "err", screen)
     listener = progress.Bars()
     listener.started(STAGE, 4, "has not run yet", False)
-    numbers = {"splats": 46913, "loss": 0.0123, "held_out_psnr_db": 27.11, "ssim": 0.8776}
+    numbers: dict[str, float | int | str] = {
+        "splats": 46913,
+        "loss": 0.0123,
+        "held_out_psnr_db": 27.11,
+        "ssim": 0.8776,
+    }
     for step in (0, 100, 300):
         listener.progressed(STAGE, "training a long_name_of_a_photograph.jpg", step, 2000, numbers)
         time.sleep(0.02)
