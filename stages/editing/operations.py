@@ -15,12 +15,14 @@ from stages import formats
 from stages.base.atomic import partial_prefix
 from stages.base.blocks import blocks
 from stages.base.errors import SplatError, UsageError
+from stages.base.text import counted
 from stages.editing import expression, levels, regions, transform
 from stages.editing.decimate import FAR_ROUND_SHARE, NEAR_ROUND_SHARE, decimate
 from stages.editing.scene import EditedScene
 from stages.editing.syntax import OPERATIONS, ParsedOperation
 from stages.editing.transform import Similarity
 from stages.evaluate.floaters import isolated_splats, near_camera_floaters
+from stages.formats import Format
 from stages.formats.values import concatenate, drop_undrawable, select_rows
 from stages.scene import Splats
 
@@ -201,6 +203,9 @@ def _limiting_size(max_bytes: float, target: Path) -> Operation:
             return row.size_bytes(path)
 
     def limited(scene: EditedScene) -> EditedScene:
+        least = size_bytes(scene.with_splats(scene.splats.take(slice(1))))
+        if least > max_bytes:
+            raise _too_small(max_bytes, least, 1, row)
         for _ in range(_ATTEMPTS):
             size, count = size_bytes(scene), len(scene.splats)
             if size <= max_bytes:
@@ -210,15 +215,19 @@ def _limiting_size(max_bytes: float, target: Path) -> Operation:
             scene = scene.with_splats(
                 decimate_scene(scene, int(_SAFETY * count * max_bytes / size))
             )
-        raise UsageError(
-            "edit-too-small",
-            given=f"--max-mb {max_bytes / 1e6:g} is less than {count:,} splats "
-            f"need as .{row.ending}.",
-            wanted=f"At least {np.ceil(size / 1e4) / 100:g}.",
-            hint="Ask for more megabytes, or for another format.",
-        )
+        raise _too_small(max_bytes, size, count, row)
 
     return limited
+
+
+def _too_small(max_bytes: float, size_bytes: int, count: int, row: Format) -> UsageError:
+    return UsageError(
+        "edit-too-small",
+        given=f"--max-mb {max_bytes / 1e6:g} is less than {counted(count, 'splat')} "
+        f"{'needs' if count == 1 else 'need'} as .{row.ending}.",
+        wanted=f"At least {np.ceil(size_bytes / 1e3) / 1000:g}.",
+        hint="Ask for more megabytes, or for another format.",
+    )
 
 
 def _rotation(parsed: ParsedOperation) -> NDArray[np.float64]:

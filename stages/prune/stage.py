@@ -27,7 +27,7 @@ from stages.formats.sog_bits import choose_bits, file_size_bytes
 from stages.prune.rounds import Pruner, PruningResult
 from stages.prune.settings import DECIDING_VIEWS, SOG_LOSS_DB, PruneSettings
 from stages.prune.summary import advise_more_splats, describe_loss, summarise
-from stages.prune.targets import Targets
+from stages.prune.targets import Targets, check_size
 from stages.raster.backends import (
     report_backend,
 )
@@ -53,6 +53,7 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     trained: TrainedSplats = inputs["train"]
     reconstruction: Reconstruction = inputs["sfm"].with_cameras(trained.cameras)
     splats, backend = trained.splats, settings.backend
+    _check_one_splat(settings, splats, reconstruction)
     training, held_out = (
         load_evaluation_views(
             reconstruction.folder, views, splats.draw_settings, report.stop_requested
@@ -132,6 +133,16 @@ def _size_measure(
         views, backend = evenly_spaced(training, DECIDING_VIEWS), settings.backend
         depths, _ = choose_bits(splats, lambda s: mean_psnr_db(s, views, backend), SOG_LOSS_DB)
     return lambda s: file_size_bytes(row, s, depths, reconstruction.units, reconstruction.views)
+
+
+def _check_one_splat(
+    settings: PruneSettings, splats: Splats, reconstruction: Reconstruction
+) -> None:
+    """Raise SplatError (prune-too-small) where --max-mb is less than a file of one splat takes."""
+    one, row = splats.take(slice(1)), FORMATS[settings.mb_of]
+    if settings.max_mb:
+        size = file_size_bytes(row, one, {}, reconstruction.units, reconstruction.views)
+        check_size(settings.max_mb * 1e6, size, len(one))
 
 
 def _report_result(before: Splats, found: PruningResult, report: Report) -> None:

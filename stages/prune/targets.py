@@ -72,15 +72,8 @@ class Targets:
 
     def check_end(self, splats: Splats, psnr_db: float) -> None:
         """Raises SplatError (prune-too-small, prune-targets-contradict)."""
-        size = self.size_bytes(splats) if self.max_bytes else 0
-        if size > self.max_bytes:
-            raise UsageError(
-                "prune-too-small",
-                given=f"--max-mb {self.max_bytes / 1e6:g} is less than "
-                f"{counted(len(splats), 'splat')} take.",
-                wanted=f"At least {np.ceil(size / 1e4) / 100:g}.",
-                hint="Ask for more megabytes, or for another format with --mb-of.",
-            )
+        if self.max_bytes:
+            check_size(self.max_bytes, self.size_bytes(splats), len(splats))
         if self.min_psnr_db > psnr_db:
             raise UsageError(
                 "prune-targets-contradict",
@@ -89,3 +82,15 @@ class Targets:
                 wanted="Targets that this scene can meet together.",
                 hint=f"Ask for --min-psnr {np.floor(psnr_db * 100) / 100:.2f}, or allow more.",
             )
+
+
+def check_size(max_bytes: float, size_bytes: int, count: int) -> None:
+    """Raises SplatError (prune-too-small) if `count` splats, in a file of `size_bytes`, take more
+    than `max_bytes`."""
+    if size_bytes > max_bytes:
+        raise UsageError(
+            "prune-too-small",
+            given=f"--max-mb {max_bytes / 1e6:g} is less than {counted(count, 'splat')} take.",
+            wanted=f"At least {np.ceil(size_bytes / 1e3) / 1000:g}.",
+            hint="Ask for more megabytes, or for another format with --mb-of.",
+        )

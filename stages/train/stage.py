@@ -40,10 +40,11 @@ from stages.train.checkpoint import remove_checkpoint
 from stages.train.conversion import splats_of
 from stages.train.loop import train
 from stages.train.quality import write_history, write_quality
-from stages.train.settings import TrainSettings
+from stages.train.settings import PRESETS, TrainSettings
 from stages.train.trainer import Trainer
 
 _TRAINED = "training.json"
+_FEW_STEPS = 500  # with a time limit
 _AT_THE_CAP = 0.98  # of it: the last round of densification seldom fills it
 
 
@@ -87,6 +88,13 @@ def run(
     remove_cap(folder)
     report.metric("splats", len(splats))
     _report_course(trainer, report)
+    if settings.seconds and trainer.schedule.steps < _FEW_STEPS:
+        report.warn(
+            "train-few-steps",
+            f"The time limit left {trainer.schedule.steps:,} steps for training; --preset preview "
+            f"makes {PRESETS['preview'].steps:,}. More --seconds, or a smaller --train-side, give "
+            "better splats.",
+        )
     _report_cap(trainer.cap, trainer.history.most_splats, report)
     report.metric("train_seconds", round(time.monotonic() - started, 1))
     return trained

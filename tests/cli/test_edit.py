@@ -15,6 +15,7 @@ from splatcli.app import app
 from splatcli.commands import edit as command
 from stages import formats
 from stages.base import scratch
+from stages.editing import operations
 from stages.editing.scene import EditedScene
 from stages.editing.syntax import OPERATIONS
 from stages.scene import Splats, View, look_at
@@ -116,6 +117,14 @@ def test_a_file_is_at_most_as_large_as_max_mb(source: Path, tmp_path: Path) -> N
     _, err = edited(source, tmp_path / "c.ply", "--max-mb", "0.000002", code=2)
     assert "edit-too-small" in err
     assert not (tmp_path / "c.ply").exists()
+
+
+def test_a_size_that_one_splat_exceeds_is_refused_at_once(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(operations, "decimate_scene", lambda *_: 1 / 0)
+    _, err = edited(source, tmp_path / "c.ply", "--max-mb", "0.0015", code=2)
+    assert "less than 1 splat needs as .ply" in err
 
 
 def test_degree_and_floaters(source: Path, tmp_path: Path) -> None:

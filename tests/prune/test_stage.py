@@ -248,6 +248,16 @@ def test_targets_that_cannot_be_met_are_refused_with_what_can_be_met(
     assert named in str(caught.value)
 
 
+def test_a_size_that_one_splat_exceeds_is_refused_before_any_picture_is_read(
+    scene, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.setattr(prune, "load_evaluation_views", lambda *_: 1 / 0)
+    with pytest.raises(SplatError) as caught:
+        run(scene, scene.splats, tmp_path, max_mb=0.001)
+    assert caught.value.code == "prune-too-small"
+    assert "1 splat take" in caught.value.given
+
+
 def test_the_report_says_what_was_removed_and_why(scene, tmp_path) -> None:
     _, report = run(scene, scene.splats, tmp_path, max_loss_db=0.02)
     cost, removed, why = report.metrics["summary"]

@@ -464,6 +464,19 @@ def test_a_cap_that_the_user_or_a_preset_set_is_reported_without_a_warning(tmp_p
     assert not (tmp_path / cap.FILE_NAME).exists()
 
 
+@pytest.mark.parametrize("seconds", [0.0, 0.5])
+def test_a_time_limit_that_left_few_steps_is_a_warning(tmp_path, seconds):
+    scene = small_scene(tmp_path)
+    inputs = {"sfm": scene.reconstruction, "seed": scene.splats.with_sh_degree(0)}
+    settings = TrainSettings(steps=30, train_side=48, sh_degree=0, max_splats=100, seconds=seconds)
+    report = Report()
+    (tmp_path / "out").mkdir()
+    train.run(inputs, settings, tmp_path / "out", report)
+    told = dict(report.warnings).get("train-few-steps", "")
+    steps = report.metrics["steps"]
+    assert told.startswith(f"The time limit left {steps} steps") if seconds else not told
+
+
 def test_splats_have_no_more_parameters_than_the_views_have_values(tmp_path, monkeypatch):
     """60 x 40 pixels of three numbers each; a splat of degree 1 has 23, one of degree 3 has 59."""
     small = camera(width=60, height=40)
