@@ -115,6 +115,7 @@ def guarded(command: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(command)
     def call(**values: Any) -> None:
         mode.quiet, mode.as_json = (values.pop(name, False) for name in ("quiet", "as_json"))
+        log.hide_warnings()
         try:
             if values.pop("verbose", False):
                 _start_log()

@@ -25,6 +25,11 @@ _log = logging.getLogger(__name__)
 _handler: logging.FileHandler | None = None
 
 
+def hide_warnings() -> None:
+    """Keep warnings of libraries, which are for programmers, from the terminal. A log has them."""
+    logging.captureWarnings(True)
+
+
 def start() -> Path | None:
     """Begin a log and write the machine and the versions to it; its path, None if no file can be
     written. A log that was begun before goes on."""
@@ -38,7 +43,6 @@ def start() -> Path | None:
     except OSError:
         return None
     _handler.setFormatter(logging.Formatter("%(asctime)s %(name)s: %(message)s"))
-    logging.captureWarnings(True)
     for logger in _LOGGERS:
         logger.addHandler(_handler)
         logger.setLevel(logging.DEBUG)
@@ -48,11 +52,11 @@ def start() -> Path | None:
 
 
 def stop() -> None:
-    """End the log, if there is one."""
+    """End the log, if there is one; warnings of libraries are printed again."""
     global _handler
+    logging.captureWarnings(False)
     if _handler is None:
         return
-    logging.captureWarnings(False)
     for logger in _LOGGERS:
         logger.removeHandler(_handler)
         logger.setLevel(logging.NOTSET)

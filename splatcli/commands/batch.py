@@ -9,7 +9,7 @@ import typer
 from splatcli import console, log, options, progress, run_settings
 from splatcli.arguments import Cluster
 from stages.distributed import remote
-from stages.distributed.batch import BatchTable, Row, run_names
+from stages.distributed.batch import BatchTable, Row, check_output, run_names
 from stages.distributed.cluster import open_executor
 from stages.distributed.tasks import TaskResult, resources_of, task_for
 
@@ -44,6 +44,7 @@ def batch(
     log.write_settings(settings)
     runs = remote.parse_location(out)
     photos = run_names(remote.expand_locations(captures))
+    check_output(runs, [*photos.values()])
     tasks = [task_for(remote.joined(runs, name), path, settings) for name, path in photos.items()]
     bars = progress.Bars() if console.mode.has_notes and console.err.is_terminal else None
     with (

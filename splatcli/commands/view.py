@@ -18,6 +18,7 @@ from splatcli.arguments import RunOrFile
 from splatcli.folders import load_target
 from splatcli.options import number
 from stages.base import interrupt, scratch
+from stages.base.atomic import partial_prefix, remove_abandoned_files
 from stages.base.errors import SplatError, UsageError
 from stages.formats import format_of, html, ply
 from stages.formats.values import drop_undrawable
@@ -67,7 +68,11 @@ def view(
     if save is not None:
         _save(target, save, camera, title, background)
         return
-    with one_signal_stops(), tempfile.TemporaryDirectory(prefix="splat-view-") as folder:
+    remove_abandoned_files(Path(tempfile.gettempdir()))  # of a view that was killed
+    with (
+        one_signal_stops(),
+        tempfile.TemporaryDirectory(prefix=partial_prefix() + "view-") as folder,
+    ):
         with scratch.scratch_in(Path(folder), spare=True):
             splats, pipeline = _loaded(target)
             count = len(splats)

@@ -8,6 +8,7 @@ the same as ours, and the world is not transformed.
 from __future__ import annotations
 
 import itertools
+import os
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.atomic import replacing
+from stages.base.atomic import replacing, temporary_beside
 from stages.base.bad_files import CAMERAS, BadFileError, reading
 from stages.cameras import colmap_records as records
 from stages.cameras.camera_file import NO_POINTS, CameraFile, FilePoints, camera_file
@@ -47,7 +48,7 @@ def write_model(
     cloud: FilePoints = NO_POINTS,
     observations: Observations = NO_OBSERVATIONS,
 ) -> None:
-    """Write the three files into `folder`, which is created. Ids are positions + 1.
+    """Write the three files into `folder`, which is created, all or none. Ids are positions + 1.
 
     Args:
         folder: for the files.
@@ -59,6 +60,20 @@ def write_model(
     Raises SplatError if they cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    with temporary_beside(folder / "cameras.bin") as path:
+        _write_files(path.parent, names, cameras, cloud, observations)
+        for file in sorted(path.parent.iterdir()):
+            os.replace(file, folder / file.name)
+
+
+def _write_files(
+    folder: Path,
+    names: Sequence[str],
+    cameras: Sequence[Camera],
+    cloud: FilePoints,
+    observations: Observations,
+) -> None:
+    """See `write_model`."""
     intrinsics = [_intrinsics(camera) for camera in cameras]
     distinct = sorted(set(intrinsics), key=intrinsics.index)
     camera_ids = {values: number for number, values in enumerate(distinct, 1)}

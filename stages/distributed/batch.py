@@ -12,6 +12,7 @@ from stages.base.errors import SplatError, UsageError
 from stages.distributed import remote
 from stages.distributed.remote import Location
 from stages.distributed.tasks import TaskResult
+from stages.run import runfolder
 from stages.run.manifest import Manifest
 from stages.run.stages import STAGE_NAMES
 
@@ -54,6 +55,13 @@ def run_names(captures: Sequence[Location]) -> dict[str, Location]:
             )
         found[name] = taken[name.casefold()] = location
     return found
+
+
+def check_output(runs: Location, captures: Sequence[Location]) -> None:
+    """Raises SplatError "run-folder-inside-photographs" for run folders among photographs."""
+    for location in captures:
+        if isinstance(runs, Path) and isinstance(location, Path):
+            runfolder.check_outside(runs, location)
 
 
 class BatchTable:

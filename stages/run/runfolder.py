@@ -104,6 +104,11 @@ def _check_photos(folder: Path, photos: Path) -> None:
             wanted="A folder of photographs as they were taken.",
             hint=f"To continue the run: splat process {run}",
         )
+    check_outside(folder, photos)
+
+
+def check_outside(folder: Path, photos: Path) -> None:
+    """Raises SplatError (run-folder-inside-photographs)."""
     if folder.resolve().is_relative_to(photos.resolve()):
         raise UsageError(
             "run-folder-inside-photographs",

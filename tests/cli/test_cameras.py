@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from stages.cameras import colmap
 from stages.cameras.camera_formats import read_cameras
 from stages.cameras.colmap import read_model
 from tests.cameras.models import example
@@ -51,6 +53,20 @@ def test_colmap_keeps_its_points(splat, tmp_path: Path) -> None:
     _, cloud, observations = read_model(Path("copy"))
     np.testing.assert_array_equal(cloud.points, example().cloud.points)
     np.testing.assert_array_equal(observations.px, example().observations.px)
+
+
+def test_a_full_disk_leaves_no_part_of_a_model(
+    splat, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    project(tmp_path / "project")
+    monkeypatch.setattr(colmap, "_write_points", full)
+    result = splat("cameras", "project", "copy")
+    assert result.exit_code == 6
+    assert "disk-full" in result.stderr
+    assert not list(Path("copy").iterdir())
 
 
 def test_a_run_gives_what_its_sfm_found(splat, pretend, tmp_path: Path) -> None:

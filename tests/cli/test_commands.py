@@ -7,9 +7,11 @@ import json
 import os
 import sys
 import time
+import warnings
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from splatcli import api, console
@@ -139,6 +141,22 @@ def test_newest_splats_are_made_from_what_lies_there(splat) -> None:
     with pytest.raises(SplatError, match="from its present sfm") as error:
         results.newest_stage_with_splats(run)
     assert error.value.code == "no-splats-yet"
+
+
+def test_warnings_of_libraries_are_in_the_log_and_not_on_the_terminal(splat, pretend) -> None:
+    def warning(inputs, settings, folder, report) -> None:
+        np.float32(1e30) * np.float32(1e30)  # RuntimeWarning: overflow
+        (folder / "out.ply").write_text("made")
+
+    pretend["train"] = warning
+    with warnings.catch_warnings(record=True) as printed:
+        warnings.simplefilter("always")
+        splat("process", "photos")
+        assert not printed
+        result = splat("train", "run", "--steps", "9", "--verbose")
+    log = Path(result.stderr.split("Log: ")[1].splitlines()[0])
+    assert "RuntimeWarning: overflow" in log.read_text()
+    log.unlink()
 
 
 def test_verbose_writes_what_a_bug_report_needs(splat, pretend) -> None:

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import signal
 import socket
+import subprocess
 import sys
+import tempfile
 import time
 import urllib.request
 import webbrowser
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from splatcli.app import app
+from splatcli.commands import view
 from splatcli.commands.view import one_signal_stops
 from stages import formats
 from stages.viewer import server
@@ -85,6 +91,33 @@ def test_many_signals_leave_no_temporary_folder(tmp_path: Path) -> None:
             it.send_signal(signal.SIGTERM)
             time.sleep(0.001)
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
+
+
+def test_the_copy_of_a_view_that_was_killed_is_removed_by_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[list[str]] = []
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    formats.write(tmp_path / "a.ply", many_splats(7))
+
+    def served(*_: object) -> None:
+        seen.append([path.name for path in (tmp_path / "temporary").iterdir()])
+        if len(seen) == 1:  # as after a kill: the folder of a process that is no more
+            left = tmp_path / "temporary" / seen[0][0]
+            dead = subprocess.run(
+                [sys.executable, "-c", "import os; print(os.getpid())"],
+                capture_output=True,
+                text=True,
+                check=True,
+            ).stdout.strip()
+            shutil.copytree(left, left.with_name(left.name.replace(str(os.getpid()), dead)))
+
+    monkeypatch.setattr(view, "_serve", served)
+    for _ in range(2):
+        assert CliRunner().invoke(app, ["view", str(tmp_path / "a.ply")]).exit_code == 0
+    assert [len(names) for names in seen] == [1, 1]
+    assert not list((tmp_path / "temporary").iterdir())
 
 
 @pytest.mark.skipif(os.name != "posix", reason="sends signals")

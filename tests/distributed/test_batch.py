@@ -89,6 +89,13 @@ def test_a_bug_in_one_capture_is_its_own(splat, captures, pretend) -> None:
     assert [e["status"] for e in ended if e["event"] == "ended"] == ["bug", "done", "done"]
 
 
+def test_runs_among_photographs_are_refused_before_anything_is_written(splat, captures) -> None:
+    result = splat("batch", *captures, "--out", f"{captures[1]}/runs")
+    assert result.exit_code == 2
+    assert "run-folder-inside-photographs" in result.stderr
+    assert [path.name for path in Path(captures[1]).iterdir()] == ["a.jpg"]
+
+
 def test_two_captures_of_one_name_are_refused(splat, captures, tmp_path) -> None:
     (tmp_path / "other" / "Room").mkdir(parents=True)
     result = splat("batch", *captures, "other/Room")
