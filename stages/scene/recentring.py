@@ -18,8 +18,13 @@ def recentred(
     """(means [N, 3] float32, origin [3]) whose sum is that of the arguments.
 
     Means that are far from zero for their spread are moved near zero by whole units; others are
-    unchanged. A value too large for float32 becomes infinite.
+    unchanged, and so are means that float32 holds as they are, because nothing is gained. A value
+    too large for float32 becomes infinite.
     """
+    with np.errstate(over="ignore"):
+        plain = means.astype(np.float32)
+    if np.array_equal(plain, means, equal_nan=True):
+        return plain, origin.copy()
     finite = means[np.isfinite(means).all(axis=1)]
     shift = np.zeros(3)
     if len(finite):

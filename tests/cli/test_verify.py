@@ -19,6 +19,7 @@ from stages.base.errors import SplatError
 from stages.run import results
 from stages.scene import ExportedAssets, ExportedFile, QuantisedSplats, Splats
 from stages.train.settings import TrainSettings
+from tests.formats.truth import many_splats
 from tests.small_scene import SmallScene, small_scene
 
 
@@ -115,6 +116,24 @@ def test_the_meshes_of_a_run_are_not_taken_for_splats(
     else:
         with pytest.raises(SplatError, match="meshes only"):
             command._files(run)
+
+
+@pytest.mark.parametrize("name", ["glb", "gltf", "usdc", "quantised.glb", "ply", "html"])
+@pytest.mark.parametrize("written", ["at once", "by convert"])
+def test_a_file_far_from_zero_is_right(tmp_path: Path, name: str, written: str) -> None:
+    splats = many_splats(500)
+    means = (np.float32(1000.5) + 0.1 * splats.means).astype(np.float32)
+    far = replace(splats, means=means, origin=np.zeros(3))
+    path = tmp_path / f"a.{name}"
+    formats.write(path, far)
+    if written == "by convert":
+        result = CliRunner().invoke(app, ["convert", str(path), str(tmp_path / f"b.{name}")])
+        assert result.exit_code == 0, result.stderr
+        path = tmp_path / f"b.{name}"
+    formats.write(tmp_path / "truth.ply", far)
+    verified(path, "--against", tmp_path / "truth.ply")
+    verified(tmp_path / "truth.ply", "--against", path)
+    verified(path, "--against", path)
 
 
 def test_verifying_changes_nothing_in_the_run(run: Path) -> None:

@@ -168,6 +168,14 @@ def test_what_lies_near_zero_is_left_where_it_is() -> None:
     np.testing.assert_array_equal(origin, [1, 2, 3])
 
 
+def test_what_32_bits_hold_as_it_is_is_left_where_it_is() -> None:
+    means = (many_splats(50).means + np.float32(70_000)).astype(np.float64)
+    near, origin = recentred(means, np.zeros(3))
+    np.testing.assert_array_equal(near, means)
+    assert not origin.any()
+    assert recentred(means + 0.1, np.zeros(3))[1].all()
+
+
 def test_one_splat_far_away_does_not_move_the_others() -> None:
     means = many_splats(50).means.astype(np.float64)
     means[7] = (4e6, 0, 0)
