@@ -72,11 +72,14 @@ def replacing(path: Path) -> Iterator[Path]:
 @contextmanager
 def temporary_beside(path: Path) -> Iterator[Path]:
     """Yield a path that ends as `path` does, folder and name, in a temporary folder beside it,
-    which is removed when the block ends."""
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=partial_prefix()) as name:
-        folder = Path(name) / path.absolute().parent.name
-        folder.mkdir(exist_ok=True)
-        yield folder / path.name
+    which is removed when the block ends. Raises as `replacing`."""
+    try:
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=partial_prefix()) as name:
+            folder = Path(name) / path.absolute().parent.name
+            folder.mkdir(exist_ok=True)
+            yield folder / path.name
+    except OSError as error:
+        raise _refused(path, error) from error
 
 
 def _temporary_name(name: str) -> str:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Sequence
 
 # C0 without the line feed, DEL, C1, and the marks that change the direction of writing.
 _CONTROLS = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
+_NO_UTF8 = re.compile("[\udc80-\udcff]")  # bytes of file names, as Python writes them (PEP 383)
 _CPP_NAME = re.compile(r"\b[A-Za-z_]\w*(?:::~?[A-Za-z_]\w*)+(?:<[^>]*>)?(?:\([^)]*\))?:?")
 _ADVICE = re.compile(r"[;,] (?:use|see|set|try|consider|pass)\b.*", re.IGNORECASE)
 
@@ -25,12 +25,10 @@ def listed(names: Sequence[str], most: int = 8) -> str:
 
 def printable(text: str) -> str:
     """`text` with escapes, such as \\x1b, for control characters except the line feed, and for
-    bytes of a file name that are not UTF-8: a terminal would act on the first and Python cannot
-    print the others."""
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        text = os.fsencode(text).decode("utf-8", "backslashreplace")
+    what is no UTF-8, such as bytes of file names: a terminal would act on the first and Python
+    cannot print the others."""
+    text = _NO_UTF8.sub(lambda found: f"\\x{ord(found[0]) - 0xDC00:02x}", text)
+    text = text.encode("utf-8", "backslashreplace").decode()
     return _CONTROLS.sub(lambda found: ascii(found[0])[1:-1], text)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,7 @@ MAX_SIDE_PX = 100_000
 MAX_DISTANCE = 1e12  # world units; its square is far from overflowing
 ROTATION_TOLERANCE = 1e-3  # of R^T R, for text with three decimals
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".heic")  # of pictures
+_NO_NAME = re.compile("[\0\ud800-\udc7f\udd00-\udfff]")  # PEP 383: \udc80 to \udcff are bytes
 _EXACT = 1e-9  # of R^T R: a larger error is not rounding of float64
 
 
@@ -138,6 +140,7 @@ def camera_file(
     """
     if not len(names):
         raise BadFileError("it holds no camera")
+    _refuse(names, [bool(_NO_NAME.search(name)) for name in names], "a name that a file can have")
     numbers = np.array([values for values, _ in optics], np.float64).reshape(-1, 6)
     sizes, intrinsics = numbers[:, :2], numbers[:, 2:]
     _refuse(names, ~((sizes >= 1) & (sizes <= MAX_SIDE_PX)).all(1), "a size in pixels")
@@ -222,5 +225,5 @@ def stored_size(path: Path) -> tuple[int, int]:
 
 
 def _refuse(names: Sequence[str], bad: Any, wanted: str) -> None:
-    if bad.any():
+    if np.any(bad):
         raise BadFileError(f"camera {names[int(np.argmax(bad))][:80]!r} lacks {wanted}")

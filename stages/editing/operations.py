@@ -28,6 +28,7 @@ from stages.scene import Splats
 
 Operation = Callable[[EditedScene], EditedScene]
 _AXES = {"x": (1.0, 0, 0), "y": (0, 1.0, 0), "z": (0, 0, 1.0)}
+_MOST_DEGREES = 1e6  # larger numbers leave no digits for the part of a turn
 _ATTEMPTS = 8  # to meet a size: one or two are enough where bytes grow with splats
 _SAFETY = 0.995
 # Rounding of a position shows from this share of the splat's size; few splats may show it.
@@ -233,7 +234,7 @@ def _too_small(max_bytes: float, size_bytes: int, count: int, row: Format) -> Us
 def _rotation(parsed: ParsedOperation) -> NDArray[np.float64]:
     axis, _, degrees = parsed.value.rpartition(":")
     angle = regions.parse_numbers(degrees, 1)
-    if angle is None:
+    if angle is None or abs(angle[0]) > _MOST_DEGREES:
         raise _wrong(parsed)
     return transform.rotation_about(_direction(parsed, axis), float(angle[0]))
 

@@ -62,14 +62,15 @@ class Similarity:
             for array in (splats.means, splats.log_scales, splats.quaternions)
         )
         sh = splats.sh
+        left = self.offset - shift  # first: their difference is exact where both are large
         left_product = _left_product(quaternions_of(self.rotation))
         sh_rotation = _sh_rotation(self.rotation, splats.sh_degree)
         rotates = not np.array_equal(self.rotation, np.eye(3))
         if rotates and splats.sh_degree:
             sh = scratch.empty(splats.sh.shape, splats.sh.dtype)
         for rows in blocks(len(splats)):
-            moved = splats.means[rows].astype(np.float64) @ linear.T + self.offset
-            means[rows] = moved - shift
+            with np.errstate(over="ignore"):  # what becomes infinite is left out and counted
+                means[rows] = splats.means[rows].astype(np.float64) @ linear.T + left
             logs[rows] = splats.log_scales[rows] + np.log(self.scale)
             quaternions[rows] = splats.quaternions[rows].astype(np.float64) @ left_product.T
             if sh is not splats.sh:

@@ -8,10 +8,12 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from stages.base.atomic import remove_abandoned_files, sync_folder, temporary_beside
-from stages.base.errors import UsageError
+from stages.base.errors import SplatError, UsageError
 from stages.formats import streamed_sog
 from stages.formats.format_table import format_of
 from stages.formats.offset import offset_path
+
+_LONGEST_NAME_BYTES = 220  # of the 255 that file systems allow
 
 
 @contextmanager
@@ -34,8 +36,16 @@ def replacing_asset(path: Path) -> Iterator[Path]:
 
 def check_target(path: Path, no_clobber: bool, source: Path | None = None) -> None:
     """Raise SplatError for a file that must not be written: "target-is-source" for `source`,
-    "target-exists" with `no_clobber` if it, or a file that belongs to it, exists."""
+    "target-exists" with `no_clobber` if it, or a file that belongs to it, exists, "name-too-long"
+    where names that are made of it would be too long for a file system."""
     row = format_of(path)
+    if (length := len(os.fsencode(path.name))) > _LONGEST_NAME_BYTES:
+        raise SplatError(
+            "name-too-long",
+            given=f"{path.name[:40]}... is a name of {length} bytes.",
+            wanted=f"At most {_LONGEST_NAME_BYTES}: files beside it have longer names.",
+            hint="Use a shorter one.",
+        )
     if source and path.exists() and source.exists() and path.samefile(source):
         raise UsageError(
             "target-is-source",

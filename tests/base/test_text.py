@@ -47,6 +47,7 @@ def test_what_a_library_said_keeps_neither_its_names_nor_its_advice(said: str, l
         ("gnp.\u202ejpg", "gnp.\\u202ejpg"),
         ("bad\udcff.jpg", "bad\\xff.jpg"),
         ("two\nlines", "two\nlines"),
+        ("half \ud800 of a pair, \udcff", "half \\ud800 of a pair, \\xff"),
     ],
 )
 def test_what_a_terminal_would_act_on_is_escaped(text: str, shown: str) -> None:

@@ -164,6 +164,12 @@ def turned(by: object) -> dict[str, Any]:
     return data
 
 
+def named(name: str) -> dict[str, Any]:
+    data = plain()
+    data["frames"][0]["file_path"] = name
+    return data
+
+
 def without(key: str) -> dict[str, Any]:
     data = plain()
     (data if key in data else data["frames"][0]).pop(key)
@@ -205,6 +211,8 @@ def without(key: str) -> dict[str, Any]:
         (turned([[1, 2], [3]]), "damaged"),
         (turned("up"), "damaged"),
         (turned([]), "damaged"),
+        (named("\ud800.png"), "name"),
+        (named("a\0.png"), "name"),
     ],
 )
 def test_what_is_no_camera_is_refused(tmp_path: Path, data: object, said: str) -> None:

@@ -232,6 +232,16 @@ def test_no_splats_are_not_written_as_a_file_of_no_bytes(tmp_path: Path) -> None
     converted(tmp_path / "a.ply", tmp_path / "b.spz")
 
 
+@pytest.mark.parametrize("ending", ["ply", "spz", "splat", "usda", "usdz", "gltf"])
+def test_a_name_too_long_for_the_files_beside_it_is_refused(tmp_path: Path, ending: str) -> None:
+    formats.write(tmp_path / "a.ply", replace(many_splats(20), origin=np.array([5e5, 0, -4])))
+    for length in (220, 221, 250):
+        name = "n" * (length - len(ending) - 1) + f".{ending}"
+        _, err = converted(tmp_path / "a.ply", tmp_path / name, code=0 if length == 220 else 3)
+        assert ("name-too-long" in err) == (length > 220)
+        assert (tmp_path / name).exists() == (length == 220)
+
+
 @pytest.mark.parametrize("name", ["scan 12:30.gltf", "50% #1?.gltf", "bad\udcff.html"])
 def test_an_unusual_name_of_a_file_is_written_and_read(tmp_path: Path, name: str) -> None:
     formats.write(tmp_path / "a.ply", many_splats(20))
@@ -297,6 +307,14 @@ def test_a_mesh_is_made_from_a_run_and_converted_neither_to_nor_from(
         assert f"splat export --format {ending}" in err
         assert "reading" not in err
         assert not (tmp_path / target).exists()
+
+
+def test_a_folder_in_the_place_of_the_target_is_told(tmp_path: Path) -> None:
+    formats.write(tmp_path / "a.ply", many_splats(20))
+    (tmp_path / "b.ply").mkdir()
+    _, err = converted(tmp_path / "a.ply", tmp_path / "b.ply", code=6)
+    assert f"{tmp_path / 'b.ply'} could not be written" in err
+    assert len([*tmp_path.iterdir()]) == 2
 
 
 def test_missing_folders_above_the_target_are_made(tmp_path: Path) -> None:

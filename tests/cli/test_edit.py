@@ -103,6 +103,13 @@ def test_files_too_far_apart_for_32_bits_are_not_merged(tmp_path: Path) -> None:
     )
 
 
+def test_a_move_farther_than_float64_is_precise_moves_the_origin_alone(
+    source: Path, tmp_path: Path
+) -> None:
+    edited(source, tmp_path / "b.ply", "--move", "1e300,0,0")
+    np.testing.assert_array_equal(result_of(tmp_path / "b.ply").means, result_of(source).means)
+
+
 def test_metres_stay_metres_until_the_scene_is_scaled(source: Path, tmp_path: Path) -> None:
     edited(source, tmp_path / "b.glb", "--move", "1,2,3", "--rotate", "x:20")
     assert formats.units_of(tmp_path / "b.glb") == "metres"
@@ -188,6 +195,7 @@ def test_where_cameras_are_known_what_is_written_is_proven(
         (["--crop", "hull:none.json"], "edit-region", 2),
         (["--rotate", "y"], "edit-rotate", 2),
         (["--rotate", "0,0,0:20"], "edit-rotate", 2),
+        (["--rotate", "x:1e300"], "edit-rotate", 2),
         (["--scale", "0"], "edit-scale", 2),
         (["--scale", "nan"], "edit-scale", 2),
         (["--move", "1,2"], "edit-move", 2),
