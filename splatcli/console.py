@@ -70,7 +70,7 @@ out = _Screen(highlight=False, soft_wrap=True)
 err = _Screen(stderr=True, highlight=False, soft_wrap=True)
 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")  # a Windows drive has one letter
-LOSSLESS_DB = 99.0  # the PSNR that is recorded for equal pictures
+EXACT_DB = 99.0  # the PSNR that is recorded for equal pictures
 
 
 @dataclass
@@ -270,8 +270,8 @@ def size(count: float) -> str:
 
 
 def fidelity(psnr_db: float) -> str:
-    """PSNR between pictures: "41.3 dB"; "lossless" for pictures that are equal."""
-    return "lossless" if psnr_db >= LOSSLESS_DB else figure("psnr_db", psnr_db)
+    """PSNR between pictures: "41.3 dB"; "exact" for pictures that are equal."""
+    return "exact" if psnr_db >= EXACT_DB else figure("psnr_db", psnr_db)
 
 
 def times(seconds: float, cpu_seconds: float) -> str:

@@ -49,7 +49,7 @@ def edit(
 
     Coordinates are those of `splat info`: y down, less the capture's origin. If the splats are a
     run's, or lie in its export folder, the PSNR of the run's photographs is printed for each
-    operation.
+    operation, and how much of their pictures is kept.
     """
     if target is None and not dry_run:
         raise UsageError(
@@ -88,7 +88,7 @@ def _edit(
             scene = edited
         facts |= {"splats": len(scene.splats), "units": scene.units, "steps": steps}
         if start_db is not None:
-            facts |= {"psnr_before_db": round(start_db, 3), "psnr_db": _db(scene)}
+            facts |= {"psnr_before_db": round(start_db, 3), **_quality(scene)}
         if not dry_run:
             unwritten, figures, losses = _written(source, target, scene)
             left_out += unwritten
@@ -139,23 +139,36 @@ def _written(
         return left_out, *require_proven(written, prover, "edit-verify-failed")
 
 
-def _db(scene: EditedScene) -> float | None:
-    found = scene.psnr_db()
-    return None if found is None else round(found, 3)
+def _quality(scene: EditedScene) -> dict[str, float]:
+    """The share of the held-out pictures that is kept, where it is not all, and their PSNR, where
+    it can be compared."""
+    found: dict[str, float] = {}
+    if scene.kept_share < 1:
+        found["pictures_kept"] = round(scene.kept_share, 4)
+    if (psnr_db := scene.psnr_db()) is not None:
+        found["psnr_db"] = round(psnr_db, 3)
+    return found
+
+
+def _quality_text(facts: dict[str, Any]) -> str:
+    """`_quality` for the end of a line."""
+    found = ""
+    if "pictures_kept" in facts:
+        found += f", {facts['pictures_kept']:.1%} of the photographs' pictures kept"
+    if "psnr_db" in facts:
+        found += f", {facts['psnr_db']:.2f} dB on photographs"
+    return found
 
 
 def _report(parsed: ParsedOperation, before: int, scene: EditedScene) -> dict[str, Any]:
     """The effect of an operation, which is printed. before: splats. scene: after it."""
     after = len(scene.splats)
     facts: dict[str, Any] = {"operation": str(parsed), "splats_before": before, "splats": after}
-    psnr = _db(scene)
-    if psnr is not None:
-        facts["psnr_db"] = psnr
+    facts |= _quality(scene)
     if console.mode.as_json:
         console.emit("operation", **facts)
     elif not console.mode.quiet:
-        cost = f", {console.figure('psnr_db', psnr)}" if psnr is not None else ""
-        console.note(f"{parsed}: {before:,} -> {after:,} splats{cost}")
+        console.note(f"{parsed}: {before:,} -> {after:,} splats{_quality_text(facts)}")
     return facts
 
 
@@ -163,9 +176,9 @@ def _show(facts: dict[str, Any]) -> None:
     for warning in facts["warnings"]:
         console.warn(f"Warning: {warning}")
     result = f"{facts['splats']:,} splats, {facts['splats_before']:,} before"
+    result += _quality_text(facts)
     if "psnr_db" in facts:
-        change = facts["psnr_db"] - facts["psnr_before_db"]
-        result += f", {facts['psnr_db']:.2f} dB on photographs ({change:+.2f})"
+        result += f" ({facts['psnr_db'] - facts['psnr_before_db']:+.2f})"
     if "verify_db" in facts:
         result += f", {console.fidelity(facts['verify_db'])} read back and drawn again"
     if "target" in facts:

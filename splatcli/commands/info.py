@@ -130,11 +130,11 @@ def _about_run(pipeline: Pipeline) -> dict[str, Any]:
 
 
 def _size_and_fidelity(file: ExportedFile, figures: dict[str, Any]) -> dict[str, Any]:
-    """figures: of the export, which read the file back and drew it. psnr_db: None if lossless."""
+    """figures: of the export, which read the file back and drew it. psnr_db: None if exact."""
     facts: dict[str, Any] = {"size_bytes": file.size_bytes}
     if "verify_db" in figures:
-        lossless = figures["verify_db"] >= console.LOSSLESS_DB
-        facts |= {"psnr_db": None if lossless else figures["verify_db"], "lossless": lossless}
+        exact = figures["verify_db"] >= console.EXACT_DB
+        facts |= {"psnr_db": None if exact else figures["verify_db"], "exact": exact}
     return facts
 
 
@@ -155,6 +155,6 @@ def _text(name: str, value: Any) -> str:
     return console.figure(name, value)
 
 
-def _asset_text(size_bytes: int, psnr_db: float | None = None, lossless: bool = False) -> str:
-    quality = "lossless" if lossless else console.figure("psnr_db", psnr_db) if psnr_db else ""
+def _asset_text(size_bytes: int, psnr_db: float | None = None, exact: bool = False) -> str:
+    quality = "exact" if exact else console.figure("psnr_db", psnr_db) if psnr_db else ""
     return ", ".join(filter(None, (console.size(size_bytes), quality)))

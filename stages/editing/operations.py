@@ -101,7 +101,7 @@ def _keeping(condition: Callable[[Splats], NDArray[np.bool_]]) -> Operation:
         found = np.empty(len(scene.splats), bool)
         for rows in blocks(len(found)):
             found[rows] = condition(scene.splats.take(rows))
-        return scene.with_splats(select_rows(scene.splats, found))
+        return scene.reduced_to(found)
 
     return kept
 

@@ -12,9 +12,11 @@ from stages.editing.decimate import RemovalCosts
 from stages.editing.transform import Similarity
 from stages.evaluate.contribution import Contributions, measure_contributions, near_view_frusta
 from stages.evaluate.evaluation import EvaluationView, mean_psnr_db
+from stages.formats.values import select_rows
 from stages.raster.backends import AUTO
 from stages.scene import Camera, Splats, View
 
+_COMPARABLE = 0.9  # of the pictures: with less, the PSNR measures what was cut away
 _UNSEEN_WEIGHT = 1e-3  # of splats that no view shows: they merge first, but not at zero cost
 
 
@@ -31,6 +33,8 @@ class EditedScene:
         placement: where the operations have moved the scene. The views above are those of the
             capture; they see the splats after this transform.
         backend: the rasteriser.
+        kept_share: how much of the held-out pictures the splats that were kept made up, by their
+            blend weights.
     """
 
     splats: Splats
@@ -40,6 +44,16 @@ class EditedScene:
     views: tuple[View, ...] = ()
     placement: Similarity = field(default_factory=Similarity)
     backend: str = AUTO
+    kept_share: float = 1.0
+
+    def reduced_to(self, found: NDArray[np.bool_]) -> EditedScene:
+        """The same scene with the splats where `found` [N] is true."""
+        share = self.kept_share
+        if len(self.held_out_views) and not found.all():
+            views = _placed(self.held_out_views, self.placement)
+            weights = measure_contributions(self.splats, views, self.backend).weight
+            share *= float(weights[found].sum() / max(weights.sum(), 1e-30))
+        return replace(self, splats=select_rows(self.splats, found), kept_share=share)
 
     def with_splats(self, splats: Splats) -> EditedScene:
         """The same scene with other splats."""
@@ -55,8 +69,9 @@ class EditedScene:
         return replace(self, splats=splats, placement=placement, units=units)
 
     def psnr_db(self) -> float | None:
-        """Mean PSNR of the held-out views; None where there are none."""
-        if not len(self.held_out_views):
+        """Mean PSNR of the held-out views; None where there are none, and where so little of their
+        pictures was kept that it says nothing."""
+        if not len(self.held_out_views) or self.kept_share < _COMPARABLE:
             return None
         views = _placed(self.held_out_views, self.placement)
         return mean_psnr_db(self.splats, views, self.backend)

@@ -35,8 +35,8 @@ def capped_psnr_db(
 
 
 def psnr_text(psnr_db: float, digits: int = 2) -> str:
-    """A capped PSNR for people: "34.21 dB", or "lossless" for identical pictures."""
-    return "lossless" if psnr_db >= IDENTICAL_DB else f"{psnr_db:.{digits}f} dB"
+    """A capped PSNR for people: "34.21 dB", or "exact" for identical pictures."""
+    return "exact" if psnr_db >= IDENTICAL_DB else f"{psnr_db:.{digits}f} dB"
 
 
 def ssim(image: NDArray[np.floating], truth: NDArray[np.floating], valid: Valid = None) -> float:

@@ -75,8 +75,8 @@ def test_sizes_read_well(count: float, text: str) -> None:
     assert console.size(count) == text
 
 
-def test_equal_pictures_are_lossless_and_no_number_of_decibels() -> None:
-    assert console.fidelity(99.0) == "lossless"
+def test_equal_pictures_are_exact_and_no_number_of_decibels() -> None:
+    assert console.fidelity(99.0) == "exact"
     assert console.fidelity(41.26) == "41.26 dB"
 
 

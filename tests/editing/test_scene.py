@@ -83,6 +83,22 @@ def test_training_views_decide_what_is_removed() -> None:
     assert (guided.psnr_db() or 0) > (judged.psnr_db() or 99) + 1
 
 
+def test_of_a_crop_the_share_of_the_pictures_is_told_and_no_psnr() -> None:
+    splats = room()
+    rng = np.random.default_rng(0)
+    splats = replace(splats, means=np.sign(splats.means) + rng.normal(0, 0.2, splats.means.shape))
+    start = scene(replace(splats, means=splats.means.astype(np.float32)))
+    half = after(start, "crop box:-9,-9,-9,9,0,9")  # the cameras stand in its plane, about
+    assert 0.4 < half.kept_share < 0.6
+    assert half.psnr_db() is None
+    quarter = after(half, "move 1,0,0", "drop box:1,-9,-9,9,9,9")
+    assert quarter.kept_share == pytest.approx(half.kept_share / 2, rel=0.3)
+    nearly = after(start, "keep opacity > 0.21")
+    assert 0.97 < nearly.kept_share < 1
+    assert nearly.psnr_db() is not None
+    assert after(start, "crop sphere:0,0,0,50").kept_share == 1
+
+
 def test_what_no_photograph_needs_close_before_a_camera_is_a_floater() -> None:
     clean = room()
     eye = cameras()[0].centre
