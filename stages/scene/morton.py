@@ -7,7 +7,15 @@ from numpy.typing import NDArray
 
 from stages.scene import Splats
 
-_BITS = 21  # three times 21 fit into 64
+BITS = 21  # three times 21 fit into 64
+# shifts and masks that insert two zero bits after each of BITS bits
+SPREADS = (
+    (32, 0x1F00000000FFFF),
+    (16, 0x1F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)
 
 
 def morton_order(splats: Splats) -> NDArray[np.intp]:
@@ -33,19 +41,13 @@ def _ranks(values: NDArray[np.floating]) -> NDArray[np.uint64]:
     distinct, place = np.unique(values, return_inverse=True)
     last = max(1, len(distinct) - 1)
     found: NDArray[np.uint64] = (
-        place.reshape(-1).astype(np.uint64) * np.uint64((1 << _BITS) - 1)
+        place.reshape(-1).astype(np.uint64) * np.uint64((1 << BITS) - 1)
     ) // np.uint64(last)
     return found
 
 
 def _spread(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
     """Insert two zero bits after each bit."""
-    for shift, mask in (
-        (32, 0x1F00000000FFFF),
-        (16, 0x1F0000FF0000FF),
-        (8, 0x100F00F00F00F00F),
-        (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    ):
+    for shift, mask in SPREADS:
         bits = (bits | (bits << np.uint64(shift))) & np.uint64(mask)
     return bits

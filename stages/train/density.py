@@ -109,10 +109,7 @@ class BoundedDensity:
 
 def cull(model: Model) -> Model:
     """The model without splats that are nearly transparent or not finite: no step improves them."""
-    keep = model.opacity_logits >= logit(MIN_OPACITY)
-    for array in model.arrays:
-        keep &= np.isfinite(array).all(tuple(range(1, array.ndim)))
-    return model.take(keep)
+    return model.take((model.opacity_logits >= logit(MIN_OPACITY)) & model.finite())
 
 
 def estimated_view_counts(counts: NDArray[np.int32], views: int) -> NDArray[np.float64]:
@@ -132,10 +129,11 @@ def split_along_longest_axis(parents: Model) -> Model:
     axes = matrices_of(children.quaternions)[rows, :, longest]
     sigma = np.exp(children.log_scales[rows, longest].astype(np.float64))
     side = np.where(rows % 2 == 0, CHILD_OFFSET, -CHILD_OFFSET)
-    children.means += ((side * sigma)[:, None] * axes).astype(np.float32)
-    children.log_scales += np.float32(np.log(CHILD_WIDTH))
-    children.log_scales[rows, longest] += np.float32(np.log(CHILD_LENGTH / CHILD_WIDTH))
-    children.opacity_logits[:] = _logits_scaled(children.opacity_logits, CHILD_OPACITY)
+    children.means = children.means + ((side * sigma)[:, None] * axes).astype(np.float32)
+    log_scales = children.log_scales + np.float32(np.log(CHILD_WIDTH))
+    log_scales[rows, longest] += np.float32(np.log(CHILD_LENGTH / CHILD_WIDTH))
+    children.log_scales = log_scales
+    children.opacity_logits = _logits_scaled(children.opacity_logits, CHILD_OPACITY)
     return children
 
 

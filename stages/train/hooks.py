@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from stages.base.errors import Interrupted
 from stages.evaluate.evaluation import EvaluationView, evaluate, evaluation_subset
 from stages.raster.backends import backend_of, rasteriser_of
-from stages.scene import Camera, Splats, morton
+from stages.scene import Camera, Splats
 from stages.train.colour_refit import ColourRefit, needs_colour_refit
 from stages.train.density import (
     AdaptiveDensity,
@@ -74,7 +74,7 @@ class FloaterRemoval:
     def after_step(self, trainer: Trainer, step: int) -> None:
         if trainer.schedule.passes(step, FLOATER_REMOVALS):
             model = trainer.model
-            trainer.replace_model(model.take(~self.free_space.contains(model.means)))
+            trainer.replace_model(model.take(~model.in_free_space(self.free_space)))
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Densification:
         cap = trainer.cap.splats  # it may have fallen below the plan
         budget = min(schedule.budget(step - 1, cap), cap)
         model = self.density.grow(model, budget, gradient_threshold(schedule.steps))
-        trainer.replace_model(model.take(morton.morton_order_of(model.means)))
+        trainer.replace_model(model.in_morton_order())
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class FinalColourRefit:
         last = step == trainer.schedule.steps
         if not last or not needs_colour_refit(trainer.task.dropout, len(trainer.task.views)):
             return
-        model = trainer.model
+        model = trainer.model.on_host()
         trainer.stepper.load(empty_model())  # a device may not hold the model twice
         refit = ColourRefit(
             rasteriser_of(backend_of(trainer.task.backend).name),

@@ -40,8 +40,11 @@ from stages.raster.kernels.simd import (
     vsqrt,
     vstore,
 )
+from stages.raster.smoothing import smoothing_widths
 from stages.scene import Camera
+from stages.scene.morton import morton_order_of
 from stages.seed.neighbours import nearest_distance
+from stages.train.free_space import FreeSpace
 
 BETA1, BETA2 = 0.9, 0.999
 # Gradients are those of H x W x loss (see `loss`), so this is about 1e-9 in the units of the mean
@@ -281,6 +284,35 @@ class Model:
     def reset_gradients(self) -> None:
         self.gradient_sum[:] = 0.0
         self.gradient_count[:] = 0
+
+    # A model on a device computes what follows there (`steps.device_model`).
+
+    def on_host(self) -> Model:
+        """The model in arrays of its own on the host; the model itself if it is there."""
+        return self
+
+    def finite(self) -> NDArray[np.bool_]:
+        """[N] splats whose parameters all are finite."""
+        good = np.ones(len(self), bool)
+        for array in self.arrays:
+            good &= np.isfinite(array).all(tuple(range(1, array.ndim)))
+        return good
+
+    def in_morton_order(self) -> Model:
+        """The model with its rows in Morton order."""
+        return self.take(morton_order_of(self.means))
+
+    def camera_distances(self, cameras: Sequence[Camera], extent: float) -> NDArray[np.float32]:
+        """See `camera_distances`; an array or a tensor, as `distances` takes it."""
+        return camera_distances(self.means, cameras, extent)
+
+    def smoothing_widths(self, cameras: Sequence[Camera], near: float) -> NDArray[np.float32]:
+        """See `raster.smoothing`; an array or a tensor, as `smoothing` takes it."""
+        return smoothing_widths(self.means, cameras, near)
+
+    def in_free_space(self, space: FreeSpace) -> NDArray[np.bool_]:
+        """[N] splats in free space."""
+        return space.contains(self.means)
 
 
 def new_model(

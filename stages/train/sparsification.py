@@ -49,7 +49,7 @@ class Sparsification:
         before, now = trainer.schedule.share(step - 1), trainer.schedule.share(step)
         if not any(before < share <= now for share in SHARES):
             return
-        model = trainer.model
+        model = trainer.model.on_host()
         trainer.stepper.load(empty_model())  # a device may not hold the model twice
         model = model.take(valid_rows(model))
         trainer.replace_model(self._sparser(trainer, model))

@@ -33,7 +33,7 @@ from stages.train.clock import Clock
 from stages.train.conversion import initial_model
 from stages.train.dropout import Dropout, uses_dropout
 from stages.train.history import History
-from stages.train.optimiser import LearningRates, Model, camera_distances
+from stages.train.optimiser import LearningRates, Model
 from stages.train.schedule import Schedule
 from stages.train.steps.memory_limited import MemoryLimitedStep
 from stages.train.steps.step import StepInput, TrainingStep, step_of
@@ -122,7 +122,7 @@ class Trainer:
         saved, step = load_checkpoint(self.task.folder, report.warn), 0
         if saved is None:
             model = initial_model(start, self.schedule.sh_degree, self.cap.splats)
-            model.distances[:] = self.camera_distances(model.means)
+            self._place(model)
         else:
             model, state = most_opaque(saved[0], self.cap.splats), saved[1]
             step, self.provenance = state.step, state.provenance
@@ -197,18 +197,19 @@ class Trainer:
     def replace_model(self, model: Model) -> None:
         """Go on with `model`: at its distances from the cameras, and under new widths of the
         smoothing filter if it is used."""
-        model.distances[:] = self.camera_distances(model.means)
+        self._place(model)
         if self.task.smooth:
-            model.smoothing[:] = self.smoothing_widths(model.means)
+            near = self.task.draw_settings.near
+            model.smoothing = model.smoothing_widths(self.cameras, near)
         self.stepper.load(model)
+
+    def _place(self, model: Model) -> None:
+        """Tell the model its distances from the cameras."""
+        model.distances = model.camera_distances(self.cameras, self.schedule.extent)
 
     def replan(self, step: int, steps: int) -> None:
         """Make `steps` steps in all, `step` of which are done."""
         self.schedule = self.schedule.replanned(step, steps)
-
-    def camera_distances(self, means: NDArray[np.float32]) -> NDArray[np.float32]:
-        """[N] of positions [N, 3]: see `optimiser.camera_distances`."""
-        return camera_distances(means, self.cameras, self.schedule.extent)
 
     def smoothing_widths(self, means: NDArray[np.floating]) -> NDArray[np.float32]:
         """[N] of the smoothing filter at positions [N, 3], from all training views at full size."""
@@ -245,7 +246,7 @@ class Trainer:
             provenance=self.provenance,
             refinement=None if self.refinement is None else self.refinement.state(),
         )
-        save_checkpoint(self.task.folder, self.model, state)
+        save_checkpoint(self.task.folder, self.model.on_host(), state)
 
     def _lower_cap(self, fits: int) -> None:
         self.cap = lower_cap(self.task.folder, fits)

@@ -20,7 +20,6 @@ from torch import Tensor
 from stages.raster.definition import OPACITY, ROTATION, SH, RasterSettings, gradient_columns
 from stages.raster.gpu.device import gpu_errors_explained, interpreted
 from stages.raster.gpu.rasteriser import DeviceScene, DeviceView, Drawn, GpuRasteriser
-from stages.raster.sh import own_coefficients
 from stages.scene import IGNORE, Camera
 from stages.train.dropout import (
     FACTORS,
@@ -40,6 +39,7 @@ from stages.train.optimiser import (
     empty_model,
 )
 from stages.train.steps import gpu_kernels
+from stages.train.steps.device_model import DeviceModel, held_of
 from stages.train.steps.step import StepInput
 from stages.train.views import Colour, Level, evened
 
@@ -155,6 +155,7 @@ class GpuStep:
         self._corrections = self._on_device(bias_corrections())
         self._unsmoothed = torch.zeros(0, device=self.device)
         self._on_host: Model | None = None
+        self._held = held_of(empty_model(), rasteriser)
         self.load(empty_model())
 
     def __len__(self) -> int:
@@ -169,14 +170,18 @@ class GpuStep:
         self._with_memory(lambda: self._load(model))
 
     def _load(self, model: Model) -> None:
-        self._scene = self.rasteriser.scene(model.arrays)
-        self._smoothing = self._on_device(model.smoothing)
-        self._distances = self._on_device(model.distances)
-        self._sh_degrees, self._own = model.sh_degrees, self._own_columns(model)
-        self._moment1, self._moment2 = map(self._on_device, (model.moment1, model.moment2))
-        self._steps = self._on_device(model.steps)
-        self._gradient_sum = self._on_device(model.gradient_sum)
-        self._gradient_count = self._on_device(model.gradient_count)
+        if isinstance(model, DeviceModel):
+            try:
+                self._held, self._on_host = model.gathered(), None
+            except torch.OutOfMemoryError:
+                if self._targets:
+                    raise
+                # the rows do not fit beside their copies
+                model = self._on_host = model.on_host()
+        if not isinstance(model, DeviceModel):
+            self._held.release()
+            self._held = held_of(model, self.rasteriser)
+        self._own = self._own_columns()
 
     def _with_memory(self, work: Callable[[], Result]) -> Result:
         """The result of `work`. If the device's memory is full, it loses its photographs, which are
@@ -192,17 +197,7 @@ class GpuStep:
 
     def model(self) -> Model:
         """See `step.TrainingStep`."""
-        if self._on_host is None:
-            rows, coefficients = _host(self._scene.rows), self._scene.coefficients
-            means, quaternions, log_scales = rows[:, :3], rows[:, 3:7], rows[:, 7:10]
-            sh = rows[:, SH : SH + 3 * coefficients].reshape(len(rows), coefficients, 3)
-            own = (means, quaternions, log_scales, rows[:, OPACITY], sh, self._sh_degrees)
-            remembered = (self._moment1, self._moment2, self._steps)
-            counted = (self._gradient_sum, self._gradient_count)
-            given = (self._smoothing, self._distances)
-            arrays = *map(np.ascontiguousarray, own), *map(_host, (*remembered, *counted, *given))
-            self._on_host = Model(*arrays)
-        return self._on_host
+        return DeviceModel(self._held) if self._on_host is None else self._on_host
 
     def step(self, given: StepInput) -> float:
         """See `step.TrainingStep`; the loss is that of LAG steps ago."""
@@ -250,11 +245,12 @@ class GpuStep:
         return np.ascontiguousarray(_host(image[:3]).transpose(1, 2, 0))
 
     def _drawn_scene(self, smooth: bool, dropout: Dropout | None = None) -> DeviceScene:
-        widths, rows = self._smoothing if smooth else self._unsmoothed, self._scene.rows
+        widths = self._held.others["smoothing"] if smooth else self._unsmoothed
+        rows, counts = self._held.scene.rows, self._held.others["gradient_count"]
         if dropout is not None:
             rows = rows.clone()
-            rows[:, OPACITY].masked_fill_(dropped(dropout, self._gradient_count), INVISIBLE)
-        return DeviceScene(rows, self._scene.coefficients, widths)
+            rows[:, OPACITY].masked_fill_(dropped(dropout, counts), INVISIBLE)
+        return DeviceScene(rows, self._held.scene.coefficients, widths)
 
     def _target(self, level: Level) -> GpuTarget:
         key = id(level.means)  # the same object each time that a level is read
@@ -271,16 +267,16 @@ class GpuStep:
         rates: LearningRates,
         room: int,
     ) -> None:
-        n, columns = self._scene.rows.shape
-        coefficients = view.coefficients(self._scene)
+        scene, held = self._held.scene, self._held.others
+        (n, columns), coefficients = scene.rows.shape, view.coefficients(scene)
         if n == 0:
             return
         parameters[:, :ROTATION] *= rates.extent
         block = 4096 if interpreted() else 16
         pixels = view.width * view.height
         gpu_kernels.adam_kernel[(triton.cdiv(n, block),)](
-            *(self._scene.rows, self._moment1, self._moment2, self._steps, parameters, means2d),
-            *(drawn.keys, self._gradient_sum, self._gradient_count, self._distances),
+            *(scene.rows, held["moment1"], held["moment2"], held["steps"], parameters, means2d),
+            *(drawn.keys, held["gradient_sum"], held["gradient_count"], held["distances"]),
             self._corrections,
             *(drawn.lists.total, room, n, gradient_columns(coefficients)),
             *(active_counts(coefficients), rates.means, rates.quaternions, rates.log_scales),
@@ -291,16 +287,14 @@ class GpuStep:
             BLOCK=block,
         )
 
-    def _own_columns(self, model: Model) -> Tensor | None:
+    def _own_columns(self) -> Tensor | None:
         """[N, columns] 0 for SH coefficients above a splat's own degree, else 1; None if every
         splat has all coefficients."""
-        coefficients = model.sh.shape[1]
-        own = own_coefficients(model.sh_degrees, coefficients)
-        if own.all():
+        columns, used = self._held.scene.layout
+        own = SH + 3 * (self._held.others["sh_degrees"].long() + 1) ** 2
+        if bool((own >= used).all()):
             return None
-        kept = np.ones((len(model), gradient_columns(coefficients)), np.float32)
-        kept[:, SH : SH + 3 * coefficients] = np.repeat(own[:, :, 0], 3, axis=1)
-        return self._on_device(kept)
+        return (torch.arange(columns, device=self.device) < own[:, None]).float()
 
     def _on_device(self, array: NDArray[Any]) -> Tensor:
         return torch.tensor(array, device=self.device)

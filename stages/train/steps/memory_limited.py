@@ -43,7 +43,7 @@ class MemoryLimitedStep:
                 return self.inner.load(model)
             except MemoryFull as full:
                 fits = self._lowered(full, len(model))
-            model = most_opaque(model, fits)
+            model = most_opaque(self.inner.model(), fits)
 
     def model(self) -> Model:
         """See `step.TrainingStep`."""

@@ -137,7 +137,7 @@ def test_a_steady_step_never_waits_for_the_device(seen, dropout, monkeypatch):
         if made.device.type == "cuda":
             torch.cuda.set_sync_debug_mode("default")
     assert not waits
-    made.model()
+    made.model().on_host()
     assert waits["cpu"] > 0  # the counter counts
 
 
@@ -187,11 +187,11 @@ def test_lists_without_room_leave_the_model_as_it_was_and_get_room():
     made, seen = stepper(lag=1), level()
     for _ in range(2):
         made.step(StepInput(seen, SETTINGS, RATES))
-    before, made._room = made.model(), 1
+    before, made._room = made.model().on_host(), 1
     made.step(
         StepInput(seen, SETTINGS, RATES, smooth=False)
     )  # has no room, which arrives one step later
-    for name, kept in vars(made.model()).items():
+    for name, kept in vars(made.model().on_host()).items():
         np.testing.assert_array_equal(kept, getattr(before, name))
     made.step(StepInput(seen, SETTINGS, RATES))
     assert int(made.skipped) == 1
@@ -205,7 +205,7 @@ def test_lists_keep_their_room_while_the_model_is_away():
     """Rounds of removal load an empty model for a moment, because a device may not hold two."""
     made, seen = stepper(), level()
     made.step(StepInput(seen, SETTINGS, RATES))
-    room, model = made._room, made.model()
+    room, model = made._room, made.model().on_host()
     made.load(empty_model())
     made.load(model)
     assert made._room == room > 0
@@ -243,13 +243,13 @@ def test_a_model_moves_between_backends_whole():
     """As a checkpoint of one backend that another goes on with."""
     made = stepper()
     made.step(StepInput(level(), SETTINGS, RATES))
-    model = made.model()
+    model = made.model().on_host()
     other = GpuStep(GpuRasteriser())
     other.load(model)
     other._on_host = None  # so that it comes from the device
     for name, kept in vars(model).items():
         np.testing.assert_array_equal(getattr(other.model(), name), kept)
     plain = ReferenceStep(ReferenceRasteriser())
-    plain.load(other.model())
+    plain.load(other.model().on_host())
     losses = [s.step(StepInput(level(), SETTINGS, RATES)) for s in (made, plain)]
     assert losses[0] == pytest.approx(losses[1], rel=1e-5)
