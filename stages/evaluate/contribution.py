@@ -108,7 +108,8 @@ def measure_contributions(
         beyond: how far each picture is continued on all sides, in longer sides of the picture. What
             is drawn there counts as if it were right; `sse` and `psnr_db` are of the picture alone.
     """
-    rasteriser, arrays = rasteriser_of(backend), splat_arrays(splats)
+    rasteriser = rasteriser_of(backend)
+    arrays = rasteriser.loaded(splat_arrays(splats))
     settings, sums = raster_settings_of(splats), _Sums(len(splats), previous)
     sh = _ShTruncation(splats, truncation, previous.sh_sums if previous else ())
     for view in views:
@@ -256,7 +257,8 @@ def blend_weights(
 ) -> Iterator[tuple[NDArray[np.int32], NDArray[np.float64]]]:
     """For each camera: the rows [K] of the splats that it shows, and the sum of each one's blend
     weights over the picture [K], pixels."""
-    rasteriser, arrays = rasteriser_of(backend), splat_arrays(splats)
+    rasteriser = rasteriser_of(backend)
+    arrays = rasteriser.loaded(splat_arrays(splats))
     settings = raster_settings_of(splats)
     for camera in cameras:
         forward = rasteriser.forward(arrays, camera, settings)

@@ -158,13 +158,18 @@ def splat_arrays(splats: Splats) -> Arrays:
 class Rasteriser(Protocol):
     """The interface of a backend. An instance must not be used by two threads at once."""
 
+    def loaded(self, arrays: Arrays) -> Any:
+        """What `forward` takes in place of `arrays` for several pictures of them: a device gets
+        them once. The arrays do not change meanwhile."""
+
     def forward(
-        self, arrays: Arrays, camera: Camera, settings: RasterSettings, depths: bool = False
+        self, arrays: Any, camera: Camera, settings: RasterSettings, depths: bool = False
     ) -> Any:
         """Draw. Returns this backend's own kind of `Forward`.
 
         Args:
-            arrays: parameters of the splats, which do not change before the backward pass.
+            arrays: parameters of the splats, which do not change before the backward pass: `Arrays`
+                or what `loaded` returned.
             camera: in the frame of the means.
             settings: how to draw.
             depths: whether to draw the depth planes.

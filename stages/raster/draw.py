@@ -35,7 +35,8 @@ def renderer(
     """A function that draws the same splats from one camera after another and keeps its buffers.
     Its results are copies. Arguments as of `render`."""
     chosen = settings or raster_settings_of(splats)
-    rasteriser, arrays = rasteriser_of(backend), splat_arrays(splats)
+    rasteriser = rasteriser_of(backend)
+    arrays = rasteriser.loaded(splat_arrays(splats))
     return lambda camera: rendering_of(rasteriser.forward(arrays, camera, chosen, depths=True))
 
 

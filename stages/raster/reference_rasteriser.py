@@ -58,6 +58,10 @@ class ReferenceRasteriser:
     """Draws and differentiates in torch, in float64. Nothing is kept between passes: the backward
     pass draws again, block by block."""
 
+    def loaded(self, arrays: Arrays) -> Arrays:
+        """See `definition.Rasteriser`."""
+        return arrays
+
     def forward(
         self, arrays: Arrays, camera: Camera, settings: RasterSettings, depths: bool = False
     ) -> ReferenceForward:

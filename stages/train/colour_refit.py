@@ -70,7 +70,7 @@ class ColourRefit:
 
     def _errors(self, model: Model) -> Iterator[tuple[object, NDArray[np.float32]]]:
         """(result of the forward pass, target less render [3, H, W]) of each view."""
-        arrays = model.drawn(self.smooth)
+        arrays = self.rasteriser.loaded(model.drawn(self.smooth))
         for level in self.levels():
             forward = self.rasteriser.forward(arrays, level.camera, self.settings)
             image = forward.image[:3]

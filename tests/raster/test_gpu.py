@@ -19,9 +19,12 @@ import torch
 pytest.importorskip("triton")
 
 from stages.base.errors import SplatError
+from stages.evaluate.contribution import measure_contributions
+from stages.evaluate.evaluation import EvaluationView
 from stages.raster import backends
 from stages.raster.backends import backend_of, rasteriser_of
 from stages.raster.definition import RasterSettings, splat_arrays
+from stages.raster.draw import renderer
 from stages.raster.gpu import device
 from stages.raster.gpu.rasteriser import GpuRasteriser
 from stages.raster.reference_rasteriser import ReferenceRasteriser
@@ -91,6 +94,23 @@ def test_contributions_agree():
         made.append(rasteriser.contributions(forward, residual))
     for column in range(3):
         assert relative(made[0][:, column], made[1][:, column]) < FLOAT32_GRADIENT
+
+
+def test_pictures_of_the_same_splats_send_them_once(monkeypatch):
+    scene, sent = cloud(20, 40, 30), []
+    send = GpuRasteriser.scene
+
+    def counting(self, arrays):
+        sent.append(arrays)
+        return send(self, arrays)
+
+    monkeypatch.setattr(GpuRasteriser, "scene", counting)
+    draw = renderer(scene, SETTINGS, "gpu")
+    pictures = [draw(camera(40, 30)).image for _ in range(2)]
+    views = [EvaluationView("one", camera(40, 30), np.zeros((30, 40, 3), np.uint8))] * 2
+    measure_contributions(scene, views, "gpu", truncation=False)
+    assert len(sent) == 2
+    np.testing.assert_array_equal(pictures[0], pictures[1])
 
 
 def test_the_same_twice_is_the_same_bytes():

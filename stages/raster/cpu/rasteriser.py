@@ -101,6 +101,10 @@ class CpuRasteriser:
         self.pool = pool or default_pool()
         self.buffers = Buffers()
 
+    def loaded(self, arrays: Arrays) -> Arrays:
+        """See `definition.Rasteriser`."""
+        return arrays
+
     def forward(
         self, arrays: Arrays, camera: Camera, settings: RasterSettings, depths: bool = False
     ) -> Forward:

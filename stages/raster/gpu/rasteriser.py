@@ -118,12 +118,22 @@ class GpuRasteriser:
         self.block = 4096 if emulated else 128
         self.real = real
 
-    def forward(
-        self, arrays: Arrays, camera: Camera, settings: RasterSettings, depths: bool = False
-    ) -> Forward:
+    def loaded(self, arrays: Arrays) -> DeviceScene:
         """See `definition.Rasteriser`."""
         with gpu_errors_explained(len(arrays[0])):
-            scene, view = self.scene(arrays), self.view(camera, settings)
+            return self.scene(arrays)
+
+    def forward(
+        self,
+        arrays: Arrays | DeviceScene,
+        camera: Camera,
+        settings: RasterSettings,
+        depths: bool = False,
+    ) -> Forward:
+        """See `definition.Rasteriser`."""
+        scene = arrays if isinstance(arrays, DeviceScene) else self.loaded(arrays)
+        with gpu_errors_explained(len(scene)):
+            view = self.view(camera, settings)
             drawn = self.draw(scene, view, depths)
             status, image = drawn.status.cpu().numpy(), drawn.image.cpu().numpy()
         return Forward(
