@@ -1,35 +1,108 @@
-"""The Python API: process a folder of photographs, and draw the splats. docs/guide/python.md shows
-its use; `splat process` does the same with a progress bar."""
+"""The Python API: process photographs, open a run, draw the splats. docs/guide/python.md shows its
+use; `splat process` does the same with a progress bar."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
+from os import PathLike
 from pathlib import Path
-from typing import Any
+from threading import Event
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.settings import changed
+from stages.base.stage import Numbers, Stage
 from stages.formats.output_formats import DEFAULT_FORMATS
+from stages.raster.definition import Rendering
 from stages.raster.draw import render
+from stages.run import results, runfolder
 from stages.run.listener import Listener
+from stages.run.manifest import plain
 from stages.run.pipeline import Pipeline
-from stages.run.results import reconstruction_of
 from stages.run.stages import STAGE_NAMES, STAGE_OF, options_of
 from stages.scene import Camera, ExportedAssets, Reconstruction, Splats
 from stages.train.settings import PRESETS
 from stages.viewer.sinks import eight_bits
 
 
-@dataclass(frozen=True)
-class Scene:
-    """The results of a finished run.
+class Options(TypedDict, total=False):
+    """The options of `process`: the fields of the stages' settings, which say what they mean
+    (`splat process --help`, and `splat STAGE --help` for the rest)."""
 
-    reconstruction: posed views and sparse points. splats: the last ones, as they were exported.
-    assets: the files that were written. metrics: figures by stage, as its manifest has them.
-    backend: draws them.
+    max_side: int
+    masks: Path | None
+    invert_masks: bool
+    mask_means: str
+    rig_mask: Path | None
+    depth: Path | None
+    frames: int
+    seed: int
+    max_features: int
+    matching: str
+    features: str
+    allow_partial: bool
+    cameras: Path | None
+    split: bool
+    refine_cameras: bool
+    metres: bool
+    scale: tuple[str, ...]
+    marker: float
+    crs: str
+    max_minutes: float
+    keep_outliers: bool
+    fill: bool
+    steps: int
+    steps_per_view: int
+    train_side: int
+    sh_degree: int
+    max_splats: int
+    seconds: float
+    smooth: bool
+    background: str
+    light: str
+    refine_in_training: bool
+    drawing: str
+    blocks: str
+    within: tuple[float, ...]
+    backend: str
+    rounds: int
+    strength: float
+    max_loss_db: float
+    max_mb: float
+    mb_of: str
+    min_psnr: float
+    finetune_steps: int
+    sh_loss_db: float
+    sog_loss_db: float
+    max_views: int
+    formats: tuple[str, ...]
+    plain_steps: int
+    rounding_steps: int
+    name: str
+    mesh_triangles: int
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a stage is. label: what it does. done, total: counts. numbers: figures so far."""
+
+    stage: str
+    label: str
+    done: int
+    total: int
+    numbers: Mapping[str, Any]
+
+
+@dataclass(frozen=True, repr=False)
+class Scene:
+    """The results of a run.
+
+    reconstruction: posed views and sparse points. splats: the newest; of a finished run as they
+    were exported. assets: the files that were written. metrics: figures by stage, as its manifest
+    has them. backend: draws them.
     """
 
     run_folder: Path
@@ -39,17 +112,37 @@ class Scene:
     metrics: Mapping[str, Mapping[str, Any]]
     backend: str
 
+    def __repr__(self) -> str:
+        views = len(self.reconstruction.views)
+        return f"Scene({str(self.run_folder)!r}, {views} views, {len(self.splats):,} splats)"
+
+    def render(self, camera: Camera) -> Rendering:
+        """Colour, alpha and depth from a camera in the world of `reconstruction`."""
+        return render(self.splats, camera, backend=self.backend)
+
     def draw(self, camera: Camera) -> NDArray[np.uint8]:
         """sRGB picture [H, W, 3] from a camera in the world of `reconstruction`."""
-        return eight_bits(render(self.splats, camera, backend=self.backend).image)
+        return eight_bits(self.render(camera).image)
+
+
+class _Calling(Listener):
+    """Calls a function with the progress of a run."""
+
+    def __init__(self, call: Callable[[Progress], None]) -> None:
+        self._call = call
+
+    def progressed(self, stage: Stage, label: str, done: int, total: int, numbers: Numbers) -> None:
+        self._call(Progress(stage.name, label, done, total, plain(numbers)))
 
 
 def process(
-    photos: Path,
-    run_folder: Path,
+    photos: str | PathLike[str],
+    run_folder: str | PathLike[str],
     preset: str = "standard",
-    listener: Listener | None = None,
-    **options: Any,
+    *,
+    progress: Callable[[Progress], None] | None = None,
+    cancel: Event | None = None,
+    **options: Unpack[Options],
 ) -> Scene:
     """Run all stages that are not finished, and load what they made.
 
@@ -57,12 +150,13 @@ def process(
         photos: folder of photographs, or a video.
         run_folder: made if missing; continued if it is a run of the same photographs.
         preset: "preview", "standard" or "best".
-        listener: receives progress, if given.
-        options: fields of the stages' settings; `SHARED_OPTIONS` says which stages get a field that
-            several have. `formats` are written beside those that the run has exported.
+        progress: called with each step of the work, in the thread that does it.
+        cancel: once it is set, the work stops at the next safe place. Signals are left as they are.
+        options: `SHARED_OPTIONS` says which stages get a field that several have. `formats` are
+            written beside those that the run has exported.
 
-    Raises SplatError as `splat process` reports it, TypeError for an unknown option, ValueError
-    for an unknown preset.
+    Raises SplatError as `splat process` reports it, Interrupted after `cancel`, TypeError for an
+    unknown option, ValueError for an unknown preset.
     """
     if preset not in PRESETS:
         raise ValueError(f"preset {preset!r}: one of {', '.join(PRESETS)} is wanted")
@@ -71,15 +165,30 @@ def process(
     known = {field.name for found in settings.values() for field in fields(found)}
     if unknown := options.keys() - known:
         raise TypeError(f"no stage has the option {', '.join(sorted(unknown))}")
-    pipeline = Pipeline(run_folder, photos)
+    pipeline = Pipeline(Path(run_folder), Path(photos))
     options["formats"] = pipeline.with_exported(options.get("formats", DEFAULT_FORMATS))
     settings = {name: changed(found, options_of(name, options)) for name, found in settings.items()}
-    manifests = pipeline.run(settings, listener=listener)
+    listener = _Calling(progress) if progress else None
+    pipeline.run(settings, listener=listener, stop=cancel or Event())
+    return open_run(run_folder)
+
+
+def open_run(run_folder: str | PathLike[str]) -> Scene:
+    """The results of a run that exists, with its newest splats; its photographs are not needed.
+
+    Raises SplatError: run-folder-missing, no-splats-yet, and what is wrong with a file.
+    """
+    folder = Path(run_folder)
+    if not runfolder.is_run_folder(folder):
+        raise runfolder.missing(folder)
+    pipeline = Pipeline(folder)
+    manifests = [m for m in map(pipeline.manifest, STAGE_NAMES) if m is not None]
+    exported = pipeline.manifest("export") is not None
     return Scene(
-        run_folder=Path(run_folder),
-        reconstruction=reconstruction_of(pipeline),
-        splats=pipeline.load("quantise").splats,
-        assets=pipeline.load("export"),
+        run_folder=folder,
+        reconstruction=results.reconstruction_of(pipeline),
+        splats=results.newest_splats(pipeline),
+        assets=pipeline.load("export") if exported else ExportedAssets(folder, ()),
         metrics={manifest.stage: manifest.metrics for manifest in manifests},
-        backend=settings["train"].backend,
+        backend=results.backend_of_run(pipeline),
     )

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from stages import formats
 from tests import sample
 from tests.docs_commands import splat_commands
 from tests.docs_tables import ROOT
@@ -69,7 +70,9 @@ def test_files_of_a_run_are_those_of_the_architecture_page(sample_run: Path) -> 
         assert (sample_run / "run" / name).exists(), f"{name} is not in a run folder"
 
 
-def test_python_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_python_example_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """With fewer and smaller steps than it says."""
     page = (ROOT / "docs" / "guide" / "python.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"```python\n(.*?)```", page, re.S)
@@ -77,10 +80,16 @@ def test_python_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert 'preset="preview"' in code
     shutil.copytree(sample.PHOTOS, tmp_path / "photos")
     monkeypatch.chdir(tmp_path)
-    made: dict[str, object] = {}
-    exec(code.replace('preset="preview"', f'{small}, formats=("ply",)'), made)
-    scene = made["scene"]
+    exec(code.replace('preset="preview"', f'{small}, formats=("ply",)'), made := {})
+    scene, drawn, opaque = made["scene"], made["drawn"], made["opaque"]
     assert (tmp_path / "view.png").stat().st_size > 1000
-    assert len(scene.splats) > 100  # type: ignore[attr-defined]
-    assert [file.format for file in scene.assets.files] == ["ply"]  # type: ignore[attr-defined]
-    assert scene.metrics["train"]["psnr_db"] > 15  # type: ignore[attr-defined]
+    assert 100 < len(opaque) < len(scene.splats)
+    assert (opaque.opacities > 0.1).all()
+    assert len(formats.read(tmp_path / "opaque.ply")) == len(opaque)
+    assert [file.format for file in scene.assets.files] == ["ply"]
+    assert scene.metrics["train"]["psnr_db"] > 15
+    assert (drawn.image.shape, drawn.depth.shape) == ((480, 640, 3), (480, 640))
+    assert drawn.alpha.mean() > 0.5
+    said = capsys.readouterr().out
+    assert re.search(r"^Scene\('run', \d+ views, [\d,]+ splats\) Splats\(", said, re.M)
+    assert re.search(r"^train training .*psnr_db", said, re.M)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
@@ -144,6 +145,7 @@ class Pipeline:
         until: str | None = None,
         may_run: Collection[str] | None = None,
         listener: Listener | None = None,
+        stop: Event | None = None,
     ) -> list[Manifest]:
         """Run what has to run, up to and including the stage `until`.
 
@@ -154,20 +156,22 @@ class Pipeline:
             until: name of the last stage; None for all, which share a limit of time.
             may_run: names of the stages that may run; it is an error if another one has to.
             listener: receives the events of the run.
+            stop: set by the caller to stop the run at the next safe boundary; without it SIGINT
+                and SIGTERM do that.
 
-        Returns the manifests in order. Raises SplatError; Interrupted after a signal. Finished
+        Returns the manifests in order. Raises SplatError; Interrupted after a stop. Finished
         stages are kept then, and the stage's own checkpoint stays in its working folder.
         """
         for given in (settings or {}).values():
             check_settings(given)  # before a folder is made
         listener = listener or Listener()
-        stop = Event()
+        handled: AbstractContextManager[None] = nullcontext()
+        if stop is None:
+            stop = Event()
+            handled = stop_on_signals(stop, listener.stopping)
         first = self.layout.workspace(self.layout.stages[0]).final
         try:
-            with (
-                runfolder.opened(self.run_folder, self.photos),
-                stop_on_signals(stop, listener.stopping),
-            ):
+            with runfolder.opened(self.run_folder, self.photos), handled:
                 for stage in self.layout.stages:
                     self.layout.workspace(stage).recover()
                 before = runfolder.recorded_for(self.run_folder, self.photos, first)

@@ -148,7 +148,7 @@ class RefinedCameras:
         return replace(view, camera=replace(camera, fx=fx, fy=fy, world_to_camera=pose))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Reconstruction:
     """Posed pinhole views and a sparse point cloud, in the levelled and recentred world.
 
@@ -178,6 +178,9 @@ class Reconstruction:
     place: EarthPlace | None = None
     levelled: bool = False
     light_explained: float = 0.0
+
+    def __repr__(self) -> str:
+        return f"Reconstruction({len(self.views)} views, {len(self.points):,} points)"
 
     def with_cameras(self, refined: RefinedCameras | None) -> Reconstruction:
         """The same with refined cameras; itself for None."""

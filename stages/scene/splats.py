@@ -18,7 +18,7 @@ ROW_FIELDS = ("means", "quaternions", "log_scales", "opacity_logits", "sh", "sh_
 """The fields of `Splats` that have a row for each splat."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Splats:
     """N splats. Arrays are float32, or float64 where a test wants more.
 
@@ -64,6 +64,12 @@ class Splats:
 
     def __len__(self) -> int:
         return len(self.means)
+
+    def __repr__(self) -> str:
+        return f"Splats({len(self):,}, SH degree {self.sh_degree})"
+
+    def __getitem__(self, index: NDArray[np.integer] | NDArray[np.bool_] | slice) -> Splats:
+        return self.take(index)
 
     @property
     def arrays(self) -> tuple[NDArray[np.floating], ...]:

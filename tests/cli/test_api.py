@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
+from threading import Event
+from typing import get_type_hints
 
+import numpy as np
 import pytest
+from PIL import Image
 
-from splatcli.api import process
-from stages.base.errors import SplatError
+import splatcli
+from splatcli import Interrupted, SplatError, open_run, process
+from splatcli.api import Options
+from stages.base.settings import settings_of
+from stages.run.stages import STAGES
+from tests import scenes
+from tests.processes import ROOT
 
 
 def test_unknown_option_is_refused(tmp_path: Path) -> None:
@@ -26,3 +39,74 @@ def test_value_out_of_range_is_the_error_of_the_command(tmp_path: Path) -> None:
         process(tmp_path, tmp_path / "run", train_side=3)
     assert caught.value.code == "option-value"
     assert not (tmp_path / "run").exists()
+
+
+def test_the_typed_options_are_the_fields_of_the_stages_settings() -> None:
+    fields = {
+        one.name: get_type_hints(s.settings_type)[one.name]
+        for s in STAGES
+        for one in settings_of(s.settings_type)
+    }
+    assert get_type_hints(Options) == {n: t for n, t in fields.items() if n != "device"}
+
+
+@pytest.mark.slow
+def test_a_type_checker_refuses_an_option_that_does_not_exist(tmp_path: Path) -> None:
+    call = "from splatcli import process\nprocess('photos', 'run', {}=3)\n"
+    for option, wrong in (("steps", False), ("stepz", True)):
+        (tmp_path / "own.py").write_text(call.format(option))
+        done = subprocess.run(
+            [sys.executable, "-m", "mypy", "--strict", "--config-file=", "own.py"],
+            cwd=tmp_path,
+            env=os.environ | {"MYPYPATH": str(ROOT)},
+            capture_output=True,
+            text=True,
+            timeout=300,
+        )
+        assert (f'Unexpected keyword argument "{option}"' in done.stdout) == wrong, done.stdout
+
+
+def test_importing_the_package_loads_nothing_and_names_what_it_has() -> None:
+    code = "import sys, splatcli; print('numpy' in sys.modules, 'stages' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False", "False"]
+    with pytest.raises(AttributeError, match="no attribute 'proces'"):
+        splatcli.proces  # noqa: B018
+
+
+def photographs(folder: Path) -> Path:
+    folder.mkdir()
+    for number in range(4):
+        picture = np.random.default_rng(number).integers(0, 255, (48, 64, 3), np.uint8)
+        Image.fromarray(picture).save(folder / f"{number}.png")
+    return folder
+
+
+def test_a_run_is_cancelled_from_its_progress_and_signals_stay_as_they_are(tmp_path: Path) -> None:
+    cancel, seen, handlers = Event(), [], set()
+
+    def stop(progress: splatcli.Progress) -> None:
+        seen.append(progress)
+        handlers.add(signal.getsignal(signal.SIGINT))
+        cancel.set()
+
+    with pytest.raises(Interrupted):
+        process(photographs(tmp_path / "p"), tmp_path / "run", progress=stop, cancel=cancel)
+    assert {one.stage for one in seen} == {"ingest"}
+    assert 0 <= seen[0].done <= seen[0].total
+    assert handlers == {signal.getsignal(signal.SIGINT)}
+    assert not (tmp_path / "run" / "2-sfm").exists()
+
+
+def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(SplatError) as caught:
+        open_run(tmp_path)
+    assert caught.value.code == "run-folder-missing"
+
+
+def test_splats_are_taken_by_a_mask_and_told_in_one_line() -> None:
+    splats = scenes.cloud(1234)
+    mask = splats.means[:, 0] > 0
+    np.testing.assert_array_equal(splats[mask].means, splats.means[mask])
+    assert len(splats[:10]) == 10
+    assert repr(splats) == f"Splats(1,234, SH degree {splats.sh_degree})"
