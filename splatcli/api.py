@@ -30,7 +30,7 @@ from stages.viewer.sinks import eight_bits
 
 class Options(TypedDict, total=False):
     """The options of `process`: the fields of the stages' settings, which say what they mean
-    (`splat process --help`, and `splat STAGE --help` for the rest)."""
+    (`splat process --help`, and the help of each stage for the rest)."""
 
     max_side: int
     masks: Path | None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -80,7 +81,8 @@ def test_python_example_runs(
     assert 'preset="preview"' in code
     shutil.copytree(sample.PHOTOS, tmp_path / "photos")
     monkeypatch.chdir(tmp_path)
-    exec(code.replace('preset="preview"', f'{small}, formats=("ply",)'), made := {})
+    made: dict[str, Any] = {}
+    exec(code.replace('preset="preview"', f'{small}, formats=("ply",)'), made)
     scene, drawn, opaque = made["scene"], made["drawn"], made["opaque"]
     assert (tmp_path / "view.png").stat().st_size > 1000
     assert 100 < len(opaque) < len(scene.splats)

@@ -25,7 +25,7 @@ from tests.processes import ROOT
 
 def test_unknown_option_is_refused(tmp_path: Path) -> None:
     with pytest.raises(TypeError, match="no stage has the option colour"):
-        process(tmp_path, tmp_path / "run", colour="red")
+        process(tmp_path, tmp_path / "run", colour="red")  # type: ignore[call-arg]
     assert not (tmp_path / "run").exists()
 
 
