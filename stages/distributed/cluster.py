@@ -11,16 +11,16 @@ import os
 import re
 import socket
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Event
 from typing import Any
 
-from stages.base.distribution import NAME, VERSION, install_command
+from stages.base.distribution import VERSION, install_command
 from stages.base.errors import Family, Interrupted, ResourceError, SplatError, UsageError
-from stages.distributed.remote import Location
+from stages.distributed.remote import Location, is_seen
 from stages.distributed.tasks import (
     Executor,
     Resources,
@@ -51,8 +51,7 @@ def edition() -> str:
 class Worker:
     """A worker's description of itself.
 
-    edition: "" if the project is not installed there. unseen: the requested paths that it does not
-    see. cpus, memory_mib: of its machine, for tasks.
+    unseen: the requested paths that it does not see. cpus, memory_mib: of its machine, for tasks.
     """
 
     host: str
@@ -177,10 +176,10 @@ def check(workers: Sequence[Worker], ours: str, token: Path | None = None) -> No
     that cannot take tasks."""
     for worker in workers:
         if worker.edition != ours:
-            theirs = f"splat {worker.edition}" if worker.edition else "no splat"
             raise UsageError(
                 "cluster-other-splat",
-                given=f"The worker {worker.host} has {theirs}; here it is splat {ours}.",
+                given=f"The worker {worker.host} has splat {worker.edition}; here it is splat "
+                f"{ours}.",
                 wanted="The same splat everywhere: another one makes other bytes.",
                 hint=f"Install the same on all of them: {install_command('cluster')}",
             )
@@ -244,7 +243,7 @@ def _describe_workers(ray: Any, paths: list[str]) -> list[Worker]:
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
     nodes = [n for n in ray.nodes() if n["Alive"] and n["Resources"].get("CPU", 0) >= 1]
-    describe = ray.remote(make_describe())
+    describe = ray.remote(_describe)
     references = [
         describe.options(
             num_cpus=0,
@@ -269,39 +268,6 @@ def _describe_workers(ray: Any, paths: list[str]) -> list[Worker]:
     ]
 
 
-def make_describe() -> Callable[[list[str]], tuple[str, list[str]]]:
-    """The function that a worker runs to describe itself: (edition, paths that it does not see).
-
-    It is a nested function, so that it is sent as code: a worker without the project could not
-    import it."""
-    name = NAME
-
-    def seen(path: str) -> bool:
-        import os  # here, as all that this function needs
-
-        if "://" not in path:
-            return os.path.exists(path)
-        try:
-            import fsspec
-
-            system, root = fsspec.core.url_to_fs(path)
-            system.exists(root)
-        except Exception:  # fsspec or its plugin, a permission, or the network is missing
-            return False
-        return True
-
-    def describe(paths: list[str]) -> tuple[str, list[str]]:
-        import importlib.metadata  # here, as all that this function needs
-
-        try:
-            from stages.distributed import cluster  # the worker's own
-
-            found = cluster.edition()
-        except (ImportError, AttributeError):
-            try:
-                found = importlib.metadata.version(name)
-            except importlib.metadata.PackageNotFoundError:
-                found = ""
-        return found, [path for path in paths if not seen(path)]
-
-    return describe
+def _describe(paths: list[str]) -> tuple[str, list[str]]:
+    """A worker's description of itself: (its edition, the paths that it does not see)."""
+    return edition(), [path for path in paths if not is_seen(path)]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import importlib
+import os
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -64,6 +65,17 @@ def capture_name(location: Location) -> str:
 def joined(location: Location, name: str) -> Location:
     """The location of `name` in a folder."""
     return f"{location.rstrip('/')}/{name}" if isinstance(location, str) else location / name
+
+
+def is_seen(location: str) -> bool:
+    """Whether this process sees a path, or reaches the file system of a URL."""
+    if "://" not in location:
+        return os.path.exists(location)
+    try:
+        RemoteFolder.at(location).names()
+    except SplatError:
+        return False
+    return True
 
 
 @contextmanager
