@@ -8,7 +8,7 @@ is not seen, and a patch seen edge-on hardly is.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from stages.evaluate.contribution import blend_weights
-from stages.raster.draw import render
-from stages.scene import Camera, Splats, look_at
+from stages.scene import Camera, Splats
 
 MIN_VIEWS = 3  # one shows a surface, two measure its depth, the third confirms it
 MIN_ANGLE_DEG = 10.0  # between views: over less, depth is hardly measured
@@ -27,7 +26,6 @@ MIN_PX = 2.0  # summed blend weight: a patch that covers less of a picture is no
 MIN_SHARE = 0.1  # of the area that the best view shows
 SUBJECT_SHARE = 0.5  # of the largest view count: patches seen so often are the subject
 _SIDE_PX = 240  # of the pictures that visibility is measured in
-_PROBE_PX = 96
 INWARD_ELEVATIONS_DEG = (0.0, 80.0)  # where somebody may hold a camera around a subject
 OUTWARD_ELEVATIONS_DEG = (-50.0, 50.0)  # where cameras look outward
 MIN_GAP_DEG = 40.0  # to the nearest view
@@ -309,8 +307,6 @@ class PoorRegion:
         views: how many see the median patch.
         angle_deg: over which they see it.
         best: the view that shows most of it.
-        move: from where the best view was taken: "left", "right" or "higher"; "" where the region
-            is occluded from all three.
     """
 
     centre: NDArray[np.float64]
@@ -318,12 +314,9 @@ class PoorRegion:
     views: int
     angle_deg: float
     best: int
-    move: str
 
 
-def poorly_covered_regions(
-    splats: Splats, patches: Patches, cameras: Sequence[Camera], backend: str, most: int = 3
-) -> tuple[PoorRegion, ...]:
+def poorly_covered_regions(patches: Patches, most: int = 3) -> tuple[PoorRegion, ...]:
     """The regions of the largest area, largest first."""
     poor = np.flatnonzero(patches.poorly_covered)
     found = []
@@ -335,9 +328,8 @@ def poorly_covered_regions(
         centre = patches.centres[own[patches.area[own].argmax()]]
         views, angle = np.median(patches.counts[rows]), np.median(patches.angles_deg[rows])
         share = float(area.sum() / patches.area.sum())
-        found.append(PoorRegion(centre, share, int(views), float(angle), best, ""))
-    found = sorted(found, key=lambda region: -region.share)[:most]
-    return tuple(replace(r, move=_move(splats, r, cameras[r.best], backend)) for r in found)
+        found.append(PoorRegion(centre, share, int(views), float(angle), best))
+    return tuple(sorted(found, key=lambda region: -region.share)[:most])
 
 
 def _connected(centres: NDArray[np.float64], side: float) -> list[NDArray[np.intp]]:
@@ -349,19 +341,3 @@ def _connected(centres: NDArray[np.float64], side: float) -> list[NDArray[np.int
     labels = connected_components(links, directed=False)[1]
     order = np.argsort(labels, kind="stable")
     return np.split(order, np.cumsum(np.bincount(labels))[:-1])
-
-
-def _move(splats: Splats, region: PoorRegion, camera: Camera, backend: str) -> str:
-    """The first of the moves after which the region is not occluded; each is by twice the smallest
-    sufficient angle."""
-    offset, side = float(np.linalg.norm(region.centre - camera.centre)), _PROBE_PX
-    length = offset * np.tan(np.radians(2 * MIN_ANGLE_DEG))
-    right, down = camera.world_to_camera[0, :3], camera.world_to_camera[1, :3]
-    for move, direction in (("left", -right), ("right", right), ("higher", -down)):
-        eye = camera.centre + length * direction
-        pose = look_at(eye, region.centre, up=-down)
-        probe = Camera(side, side, side, side, side / 2, side / 2, pose)
-        depth = float(np.median(render(splats, probe, backend=backend).depth[46:50, 46:50]))
-        if depth > 0.9 * float(np.linalg.norm(region.centre - eye)):
-            return move
-    return ""

@@ -26,14 +26,7 @@ from stages.evaluate.floaters import near_camera_floaters
 from stages.formats.sog_quantisation import splats_to_write
 from stages.formats.values import drop_undrawable
 from stages.raster.backends import CPU, backend_of
-from stages.scene import (
-    DrawSettings,
-    QuantisedSplats,
-    Splats,
-    View,
-    evenly_spaced,
-    split_held_out,
-)
+from stages.scene import DrawSettings, QuantisedSplats, Splats, View, evenly_spaced, split_held_out
 from stages.tradeoff.curves import (
     Coverage,
     HistoryPoint,
@@ -213,7 +206,7 @@ def measure_coverage(
         patches=patches,
         layout=layout,
         gaps=find_gaps(layout, patches, cameras) if layout else (),
-        regions=poorly_covered_regions(splats, patches, cameras, backend) if layout else (),
+        regions=poorly_covered_regions(patches) if layout else (),
         floaters=splats.means[is_floater].astype(np.float64),
     )
 

@@ -184,13 +184,10 @@ def _region(coverage: Coverage, letter: str, region: PoorRegion) -> str:
     seen = f"seen by {counted(region.views, 'view')}"
     if region.views > 1:
         seen += f", over {region.angle_deg:.0f}°"
-    line = (
-        f"Region {letter}, {_POSITIONS[row][column]} in {name}: {seen}; {region.share:.0%} of all."
+    return (
+        f"Region {letter}, {_POSITIONS[row][column]} in {name}: {seen}; {region.share:.0%} of all. "
+        f"Photograph it from beside or above where {name} was taken, by a third of its distance."
     )
-    if not region.move:
-        return line
-    side = f"to the {region.move} of" if region.move != "higher" else "higher than"
-    return f"{line} Photograph it from {side} where {name} was taken, by a third of its distance."
 
 
 def _floaters(coverage: Coverage) -> str:
