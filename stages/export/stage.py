@@ -22,17 +22,13 @@ from stages.export.settings import ExportSettings
 from stages.formats import format_of
 from stages.formats.format_table import FORMATS
 from stages.formats.mesh_files import CODECS_OF_MESHES
-from stages.formats.output_formats import (
-    mesh_formats,
-)
+from stages.formats.output_formats import mesh_formats
 from stages.formats.sog_quantisation import splats_to_write
 from stages.formats.values import drop_undrawable
 from stages.mesh.collision_mesh import make_collision_mesh
 from stages.proof.losses import losses_of
 from stages.proof.prover import Prover, cameras_for, provers_of
-from stages.raster.backends import (
-    report_backend,
-)
+from stages.raster.backends import report_backend
 from stages.scene import ExportedAssets, ExportedFile, QuantisedSplats, Reconstruction, Splats
 
 _INDEX = "assets.json"

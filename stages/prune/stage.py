@@ -28,9 +28,7 @@ from stages.prune.rounds import Pruner, PruningResult
 from stages.prune.settings import DECIDING_VIEWS, SOG_LOSS_DB, PruneSettings
 from stages.prune.summary import advise_more_splats, describe_loss, summarise
 from stages.prune.targets import Targets, check_size
-from stages.raster.backends import (
-    report_backend,
-)
+from stages.raster.backends import report_backend
 from stages.scene import (
     Reconstruction,
     Splats,

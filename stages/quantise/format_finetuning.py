@@ -19,13 +19,7 @@ from stages.formats.values import drop_undrawable
 from stages.quantise.rounding import finetune_to_rounding, write_and_read
 from stages.quantise.settings import QuantiseSettings
 from stages.raster.compensation import without_compensation
-from stages.scene import (
-    QuantisedSplats,
-    Reconstruction,
-    Splats,
-    split_held_out,
-    training_extent,
-)
+from stages.scene import QuantisedSplats, Reconstruction, Splats, split_held_out, training_extent
 from stages.train.finetune import FineTuner
 
 

@@ -14,7 +14,7 @@ from stages.formats.output_formats import (
     formats_setting,
     formats_to_finetune,
 )
-from stages.prune.settings import DECIDING_VIEWS, SOG_LOSS_DB
+from stages.prune.settings import SOG_LOSS_DB
 from stages.raster.backends import backend_setting
 
 
@@ -32,9 +32,6 @@ class QuantiseSettings:
         "fine-tuning recovers a part of it (dB).",
         min=0,
         max=100,
-    )
-    max_views: int = setting(
-        DECIDING_VIEWS, "Training views to measure on, at most.", min=1, max=100_000
     )
     formats: tuple[str, ...] = formats_setting(
         formats_to_finetune(DEFAULT_FORMATS, AUTO),

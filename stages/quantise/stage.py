@@ -36,12 +36,11 @@ from stages.evaluate.sh import sufficient_degrees, truncate_sh, view_averaged_dc
 from stages.formats.format_table import FORMATS, PLAIN
 from stages.formats.sog_bits import choose_bits
 from stages.formats.sog_quantisation import splats_to_write
+from stages.prune.settings import DECIDING_VIEWS
 from stages.quantise.format_finetuning import FormatFinetuning
 from stages.quantise.rounding import write_and_read
 from stages.quantise.settings import QuantiseSettings
-from stages.raster.backends import (
-    report_backend,
-)
+from stages.raster.backends import report_backend
 from stages.scene import (
     DrawSettings,
     QuantisedSplats,
@@ -185,7 +184,7 @@ def _measures(
             wanted="At least one, to measure on.",
             hint="Run `splat sfm` again.",
         )
-    deciding = tuple(evenly_spaced(training, settings.max_views))
+    deciding = tuple(evenly_spaced(training, DECIDING_VIEWS))
     evaluated, what = (held_out, "held out") if held_out else (deciding, "training")
     folder, backend = reconstruction.folder, settings.backend
     decider, evaluator = (

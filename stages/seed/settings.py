@@ -12,7 +12,6 @@ from stages.base.stage import Stage, in_module
 class SeedSettings:
     """Settings of the initial splats."""
 
-    keep_outliers: bool = setting(False, "Keep points that look misplaced or are far away.")
     fill: bool = setting(True, "Add splats where photographs show surfaces without points.")
 
 

@@ -53,7 +53,7 @@ def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report:
     Raises SplatError "seed-too-few-points" if fewer than 50 points are usable.
     """
     reconstruction: Reconstruction = inputs["sfm"]
-    keep = _usable(reconstruction, settings.keep_outliers, report)
+    keep = _usable(reconstruction, report)
     points = reconstruction.points[keep]
     if len(points) < _FEWEST_SPLATS:
         raise _too_few(len(points), len(reconstruction.points))
@@ -94,13 +94,11 @@ def load(folder: Path) -> Splats:
     return load_splats(folder)
 
 
-def _usable(
-    reconstruction: Reconstruction, keep_outliers: bool, report: Report
-) -> NDArray[np.bool_]:
-    """[P] the points to start from: finite, and no outliers unless these are kept."""
+def _usable(reconstruction: Reconstruction, report: Report) -> NDArray[np.bool_]:
+    """[P] the points to start from: finite, and no outliers."""
     finite: NDArray[np.bool_] = np.all(np.isfinite(reconstruction.points), axis=1)
     reasons: dict[str, NDArray[np.bool_]] = {"not_finite": ~finite}
-    if not keep_outliers and finite.any():
+    if finite.any():
         reasons |= _outliers(reconstruction, finite)
     keep = ~np.logical_or.reduce(list(reasons.values()))
     _report_outliers(reasons, keep, report)

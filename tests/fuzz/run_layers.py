@@ -48,7 +48,7 @@ def _manifest(folder: Path) -> None:
 
     records = record_files(folder)
     Manifest(
-        *("seed", 4, {"fill": True, "keep_outliers": 2.5}, {"sfm": "ab" * 32}, records, "cd" * 32),
+        *("seed", 4, {"fill": 2.5}, {"sfm": "ab" * 32}, records, "cd" * 32),
         *(1.5, 2.5, 300.0, "a processor", 7, {"photographs": records}),
     ).write(folder)
 
