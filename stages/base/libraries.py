@@ -1,4 +1,4 @@
-"""Which versions of which libraries made an output."""
+"""The versions of the libraries that made an output."""
 
 from __future__ import annotations
 

@@ -59,8 +59,8 @@ def write(
     points: NDArray[np.float64] | None = None,
     colours: NDArray[np.uint8] | None = None,
 ) -> None:
-    """Write the views, and the points into a .ply of the same name beside the file, from which
-    nerfstudio initialises splats. Raises SplatError if a file cannot be written.
+    """Write the views. The points go into a .ply of the same name beside the file: nerfstudio
+    initialises splats from it. Raises SplatError if a file cannot be written.
 
     Args:
         path: of transforms.json.

@@ -1,7 +1,7 @@
 """Training of a large scene in blocks.
 
-1. A coarse model of the whole scene is trained. It decides which views show which block, and is the
-   background of each block's training.
+1. A coarse model of the whole scene is trained. It says which views show each block, and is the
+   background while a block is trained.
 2. Each block is trained by an executor, in a run folder of its own under `blocks/`.
 3. The splats of each block that lie in its cell are merged, and the seams between blocks are
    fine-tuned on the views that cross them.

@@ -142,8 +142,8 @@ def open_executor(
 def connect(address: str, folder: Location, paths: Iterable[Location]) -> Iterator[RayExecutor]:
     """The cluster at `address` ("local:N": N workers of this machine, started and ended here).
 
-    Each of its machines must have the same edition of the project, and see `folder` (a writable
-    folder that exists, or a URL) and those of `paths` that exist. Raises SplatError:
+    Each of its machines must have the same edition of the project, and see `folder` and all
+    existing `paths`. folder: exists and can be written to; or a URL. Raises SplatError:
     cluster-not-installed, cluster-not-found, cluster-other-splat, cluster-folder-unseen.
     """
     ray = _ray()

@@ -86,7 +86,7 @@ class EditedScene:
         return [self.placement.apply_to_camera(view.camera) for view in self.training_views]
 
     def contributions(self) -> Contributions:
-        """The contribution of each splat to the training views, of which there must be some."""
+        """The contribution of each splat to the training views. There must be training views."""
         views = _placed(self.training_views, self.placement)
         return measure_contributions(self.splats, views, self.backend)
 

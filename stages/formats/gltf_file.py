@@ -60,7 +60,7 @@ def write_file(
         primitives: attributes by name, all with the same number of rows, y up.
         splats: for what asset.extras holds: origin and place, in the axes of the file, because
             positions relative to 0 would exceed the precision of float32; whether they are to be
-            drawn with opacity compensation, of which KHR_gaussian_splatting says nothing.
+            drawn with opacity compensation: KHR_gaussian_splatting has no field for it.
         units: "metres" or "arbitrary".
         node_scale: scale of the node.
 

@@ -110,8 +110,8 @@ def _without_pictures_of_scans(files: Iterable[str], pictures: list[str]) -> lis
 def _remove_masks(
     files: dict[str, Path], folder: Path, apart: Path | None
 ) -> tuple[dict[str, Path], tuple[str, ...]]:
-    """Remove masks from `files`: those in a folder called masks, those in `apart` if it is inside,
-    and those beside their photographs. Returns masks by the photograph's name, and stray masks."""
+    """Remove masks from `files`: in a folder called masks, in `apart` if it is inside, and beside
+    their photographs. Returns masks by the photograph's name, and stray masks."""
     apart, photos = apart.resolve() if apart is not None else None, folder.resolve()
     inside = {
         name: name.partition("/")[2]
@@ -144,9 +144,9 @@ def _remove_masks(
 def _remove_depths(
     files: dict[str, Path], folder: Path, source: Path | None
 ) -> tuple[dict[str, DepthFile], tuple[str, ...]]:
-    """Remove maps of depth and of confidence from `files`, if any map belongs to a photograph:
-    those in a folder called depth, those beside photographs, and those of `source`. Returns maps by
-    the photograph's name, and stray ones."""
+    """Remove maps of depth and of confidence from `files`, if any map belongs to a photograph. Maps
+    are in a folder called depth, beside photographs, and in `source`. Returns maps by the
+    photograph's name, and stray ones."""
     maps: dict[str, Path] = {}
     unit = 0.0
     if source is not None and source.is_file():

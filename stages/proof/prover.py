@@ -209,8 +209,8 @@ class Prover:
 def provers_of(
     quantised: QuantisedSplats, cameras: tuple[Camera, ...], backend: str
 ) -> Callable[[Splats], Prover]:
-    """The prover for the splats of a file of a run: with the pictures of the run's splats that are
-    drawn in the same way, which show all that the format loses."""
+    """A function that gives the prover for the splats of a file of a run. It compares with pictures
+    of the run's own splats, drawn as the file is, so that all losses of the format show."""
     originals = [s for s in (quantised.splats, quantised.plain) if s is not None]
     provers = {
         splats.draw_settings.antialias: Prover.of(drop_undrawable(splats)[0], cameras, backend)

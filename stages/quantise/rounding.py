@@ -37,9 +37,10 @@ def finetune_to_rounding(
     steps: int,
     view_counts: NDArray[np.int32],
 ) -> Splats:
-    """Splats whose values `rounded`, which keeps the rows, leaves nearly unchanged.
+    """The splats, fine-tuned until `rounded` hardly changes them.
 
-    steps: of fine-tuning after each attribute that it changes. Raises Interrupted."""
+    rounded: rounds the values of splats and keeps their rows. steps: of fine-tuning after each
+    attribute that it changes. Raises Interrupted."""
     frozen: list[str] = []
     for name in ORDER:
         candidate = _with_attribute(name, splats, rounded(splats))

@@ -163,8 +163,8 @@ def _flat_colours(
 
 
 def _bytes(splats: Splats) -> int:
-    """As float32 with the same SH degree for all and 11 other values, which is what most formats
-    hold; each splat's own degree helps only formats that compress zeros."""
+    """The size of the splats in float32: 11 values each, and the SH coefficients of the highest
+    degree, as most formats hold them. Lower degrees help only formats that compress zeros."""
     found: int = 4 * len(splats) * (11 + 3 * splats.sh.shape[1])
     return found
 

@@ -97,8 +97,8 @@ def stage_folder_around(place: Path) -> Path | None:
 
 
 def settings_of_stages(folder: Path) -> dict[str, dict[str, Any]]:
-    """Settings as plain data by stage name: those of the finished stages, and over them those of
-    unfinished attempts, which were requested later. Damaged files are left out.
+    """Settings as JSON data by stage name. An unfinished attempt was requested after the stage had
+    finished: its settings replace those of the finished stage. Damaged files are left out.
 
     Raises SplatError: run-folder-older, run-folder-newer, run-folder-unreadable.
     """

@@ -4,7 +4,7 @@
 interruption, and after a failure with the reason in it. `.4-train.old` is the previous output
 between the two renames that replace it, and until the files in it that the stage did not write
 have moved to the new output. After a crash at any point either the old or the new output is
-complete, and those files are in one of the two.
+complete, and files of others are in one of them.
 """
 
 from __future__ import annotations

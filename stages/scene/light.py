@@ -4,7 +4,7 @@ Above the linear segment near black, light = ((value + 0.055) / 1.055)^2.4 (IEC 
 multiplying the light by a factor is the same affine map for all values.
 
 Vignetting is by how many EV a picture is darker at a distance r from its principal point, in half
-diagonals of the picture: k1 r^2 + k2 r^4 + k3 r^6, none of which is negative.
+diagonals of the picture: k1 r^2 + k2 r^4 + k3 r^6, with k1, k2, k3 >= 0.
 """
 
 from __future__ import annotations

@@ -8,9 +8,9 @@ sum over the gradients of the splats, and no rasteriser has to know of it:
 - rotation about the camera's centre: the torques of the gradients by means and by quaternions;
 - focal length: where it grows by a share, everything comes nearer by that share along the axis.
 
-Left out are the view-dependent part of the colour, which a rotation would leave as it is, and the
-thickness of splats along the optical axis, which a focal length does. The parameters are optimised
-by Adam (Kingma and Ba 2015) with step sizes that decay exponentially.
+Two terms are left out: a rotation does not change the view-dependent part of the colour, and a
+focal length does not change the thickness of splats along the optical axis. The parameters are
+optimised by Adam (Kingma and Ba 2015) with step sizes that decay exponentially.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class CameraRefinement:
         return float(np.median(moved)), float(np.degrees(np.median(turned.magnitude())))
 
     def camera(self, row: int, camera: Camera) -> Camera:
-        """The camera of view `row`, of which `camera` has the size and the first lens."""
+        """The refined camera of view `row`. camera: as it was before."""
         fx, fy = camera.fx * self.focal_factor, camera.fy * self.focal_factor
         return replace(camera, fx=fx, fy=fy, world_to_camera=self.poses[row].copy())
 

@@ -24,7 +24,7 @@ DEVICE_MEMORY = "the GPU's memory"
 PHOTOGRAPHS = "the photographs' pixels"
 BYTES_PER_SPLAT = 1600  # parameters, moments, gradients, footprint and about 6 intersections
 MIN_CAP = 10_000  # splats that are always allowed
-BASE_MIB = 2048.0  # libraries, and photographs of which at most 1 GiB is kept
+BASE_MIB = 2048.0  # libraries, and at most 1 GiB of photographs
 
 
 @dataclass(frozen=True)

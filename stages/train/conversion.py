@@ -1,4 +1,4 @@
-"""Between `Splats`, which stages exchange, and `Model`, which is optimised."""
+"""Conversion of `Splats`, which stages exchange, to `Model`, which is optimised, and back."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def splats_of(model: Model, sh_degree: int, start: Splats, draw_settings: DrawSe
 
 
 def valid_rows(model: Model) -> NDArray[np.bool_]:
-    """[N] splats of which all parameters are finite, and the rotation is one."""
+    """[N] whether all parameters of a splat are finite, and its quaternion is not 0."""
     norms = _norms(model)[:, 0]
     valid = np.isfinite(norms) & (norms > 0)
     for array in model.arrays:

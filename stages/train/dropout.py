@@ -60,9 +60,9 @@ class Dropout:
 
 
 def noise(n: int, key: int) -> NDArray[np.uint32]:
-    """[n] uniform over 32 bits, the same for all splats of a neighbourhood: a hash of neighbourhood
-    and key by the finaliser of MurmurHash3 (Appleby, public domain), which gives the same values on
-    every device and in any order."""
+    """[n] uniform over 32 bits, equal for all splats of a neighbourhood: a hash of its number and
+    the key by the finaliser of MurmurHash3 (Appleby, public domain). The values depend neither on
+    the device nor on the order."""
     h = np.arange(n, dtype=np.uint32) // np.uint32(NEIGHBOURHOOD)
     h = h * np.uint32(INCREMENT) + np.uint32(key)
     for shift, factor in FACTORS:

@@ -75,8 +75,8 @@ class Schedule:
         return replace(self, steps=steps, since=(since, share))
 
     def replanned(self, step: int, steps: int) -> Schedule:
-        """The same run, of which `step` steps are done, with `steps` in all: the rest of the
-        schedule is compressed or stretched."""
+        """The same run with `steps` steps in all, after `step` of them: the rest of the schedule is
+        compressed or stretched."""
         return replace(self, steps=max(steps, step + 1), since=(step, self.share(step)))
 
     def densifying(self, step: int) -> bool:

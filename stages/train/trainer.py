@@ -208,7 +208,7 @@ class Trainer:
         model.distances = model.camera_distances(self.cameras, self.schedule.extent)
 
     def replan(self, step: int, steps: int) -> None:
-        """Make `steps` steps in all, `step` of which are done."""
+        """Make `steps` steps in all; `step` are done."""
         self.schedule = self.schedule.replanned(step, steps)
 
     def smoothing_widths(self, means: NDArray[np.floating]) -> NDArray[np.float32]:

@@ -94,7 +94,7 @@ class LivePage:
             self.frames.offer_last(draw, done)
 
     def ended(self, how: str) -> None:
-        """how: "finished" or "stopped", of which the first counts. The page gets it with its next
+        """how: "finished" or "stopped"; only the first call counts. The page gets it with its next
         request for the state."""
         self.frames.close()
         self._state = {**self._state, "end": self._state["end"] or how}
