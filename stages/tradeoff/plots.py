@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
@@ -11,14 +10,13 @@ from numpy.typing import NDArray
 
 from stages.base.plots import BLUE, GREY, ORANGE, new_maps, new_plot, write_plot
 from stages.evaluate.coverage import weighted_quantile
-from stages.tradeoff.curves import Coverage, OperatingPoint, Tradeoff
+from stages.tradeoff.curves import Coverage, Tradeoff
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _PSNR = "held-out PSNR (dB)"
-_NEAR, _NEAR_DB = 1.4, 0.02  # ratio of sizes, and PSNR: labels of nearer points would overlap
 _CELLS = 60  # of the map, along its longer side
 _MAX_COUNT, _MAX_ANGLE_DEG = 8.0, 60.0  # more is as good
 _MARGIN = 0.08
@@ -30,7 +28,6 @@ _NAME_DISTANCE = 0.05  # of the map: closer names cannot be read
 def write_plots(folder: Path, tradeoff: Tradeoff) -> list[Path]:
     """PNG files, without a plot of time where training logged none. Raises SplatError."""
     figures = {
-        "formats": _formats(tradeoff),
         "splats": _splats(tradeoff),
         "drawing": _drawing(tradeoff),
     }
@@ -60,39 +57,6 @@ def _time(tradeoff: Tradeoff) -> Figure:
     return figure
 
 
-def _formats(tradeoff: Tradeoff) -> Figure:
-    figure, axes = new_plot("The run in each file format", "file size (MB)", _PSNR)
-    for point in tradeoff.formats:
-        written = point.label.removeprefix(".") in tradeoff.exported
-        _with_bars(axes, [_megabytes(point)], [point], ORANGE if written else BLUE, "o")
-    for group in _near_groups(tradeoff.formats):
-        at = (_megabytes(group[0]), group[0].psnr_db)
-        names = "\n".join(point.label for point in group)
-        axes.annotate(names, at, (5, -3), textcoords="offset points", fontsize=8, va="top")
-    axes.axhline(tradeoff.own.psnr_db, color=GREY, linewidth=0.8, linestyle=":")
-    axes.margins(x=0.1)
-    _logarithmic(axes)
-    _legend(axes, ("other formats", BLUE), ("written by this run", ORANGE))
-    return figure
-
-
-def _megabytes(point: OperatingPoint) -> float:
-    return (point.size_bytes or 0) / 1e6
-
-
-def _near_groups(points: Sequence[OperatingPoint]) -> list[list[OperatingPoint]]:
-    """Points, smallest first, in groups that are too close to be labelled one by one."""
-    groups: list[list[OperatingPoint]] = []
-    for point in points:
-        first = groups[-1][0] if groups else None
-        near = first is not None and _megabytes(point) < _NEAR * _megabytes(first)
-        if first is not None and near and abs(point.psnr_db - first.psnr_db) < _NEAR_DB:
-            groups[-1].append(point)
-        else:
-            groups.append([point])
-    return groups
-
-
 def _splats(tradeoff: Tradeoff) -> Figure:
     title = "Fewer splats, fine-tuned after each removal"
     figure, axes = new_plot(title, "splats", _PSNR)
@@ -113,41 +77,18 @@ def _curve(axes: Axes, tradeoff: Tradeoff, costs: list[float]) -> None:
     """The pruned splats over their cost, with the run itself and the knee marked."""
     points, at = tradeoff.pruned, tradeoff.knee
     axes.plot(costs, [p.psnr_db for p in points], "-", color=BLUE, linewidth=1)
-    _with_bars(axes, costs[1:], points[1:], BLUE, "o")
+    for x, point in zip(costs[1:], points[1:], strict=True):
+        low, high = point.change.mean - point.change.low, point.change.high - point.change.mean
+        bars = [[low], [high]] if max(low, high) < float("inf") else None
+        axes.errorbar(
+            [x], [point.psnr_db], yerr=bars, fmt="o", color=BLUE, ms=5, elinewidth=1, capsize=3
+        )
     axes.plot(costs[:1], [points[0].psnr_db], "D", color=ORANGE, label="this run")
     if at:
         knee_at = [costs[at]], [points[at].psnr_db]
         axes.plot(*knee_at, "o", ms=13, mfc="none", color=ORANGE, label="knee")
     axes.errorbar([], [], yerr=[], fmt="o", color=BLUE, label="95 % interval of the change")
     axes.legend()
-
-
-def _with_bars(
-    axes: Axes, xs: Sequence[float], points: Sequence[OperatingPoint], colour: str, mark: str
-) -> None:
-    """Points with the interval of their change against the run's own splats, where it has ends."""
-    for x, point in zip(xs, points, strict=True):
-        low, high = point.change.mean - point.change.low, point.change.high - point.change.mean
-        bars = [[low], [high]] if max(low, high) < float("inf") else None
-        axes.errorbar(
-            [x], [point.psnr_db], yerr=bars, fmt=mark, color=colour, ms=5, elinewidth=1, capsize=3
-        )
-
-
-def _logarithmic(axes: Axes) -> None:
-    from matplotlib.ticker import LogLocator, NullFormatter
-
-    axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_formatter(NullFormatter())
-
-
-def _legend(axes: Axes, *entries: tuple[str, str]) -> None:
-    from matplotlib.lines import Line2D
-
-    handles = [Line2D([], [], marker="o", linestyle="", color=c, label=w) for w, c in entries]
-    axes.legend(handles=handles, loc="lower right")
 
 
 def _coverage_maps(coverage: Coverage) -> Figure:

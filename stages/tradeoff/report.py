@@ -83,7 +83,7 @@ def _row(point: OperatingPoint) -> Iterator[str]:
 def _formats_table(tradeoff: Tradeoff) -> str:
     rows = [
         (
-            point.label,
+            point.label + (" (this run)" if point.label[1:] in tradeoff.exported else ""),
             f"{(point.size_bytes or 0) / 1e6:.2f} MB",
             f"{point.psnr_db:.2f} dB",
             f"{point.change.mean:+.3f} dB",

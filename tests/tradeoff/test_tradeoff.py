@@ -163,7 +163,7 @@ def test_the_report_is_one_file_that_needs_no_other(tradeoff, inputs, tmp_path) 
     files = write_report(tmp_path, "<scene>", tradeoff, inputs)
     assert {file.name for file in files} == {
         *("report.html", "tradeoff.csv"),
-        *(f"{n}.png" for n in ("time", "formats", "splats", "drawing", "coverage")),
+        *(f"{n}.png" for n in ("time", "splats", "drawing", "coverage")),
     }
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert not re.findall(r"(?:src|href)=\"(?!data:)", text)
@@ -199,7 +199,6 @@ def test_plots_have_axes_with_units_and_legends(tradeoff, inputs, tmp_path, monk
     labels = {name: figure.axes[0].get_xlabel() for name, figure in shown.items()}
     assert labels == {
         "time": "CPU time of all threads (s)",
-        "formats": "file size (MB)",
         "splats": "splats",
         "drawing": "CPU time of a picture (ms)",
     }
