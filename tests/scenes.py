@@ -22,7 +22,7 @@ from stages.raster.draw import rendering_of
 from stages.scene import Camera, Splats, logit, rgb_to_dc
 
 # Those that run everywhere. What they are held to, tests/raster/test_gpu.py holds the GPU's to.
-BACKENDS = tuple(backend.name for backend in backends.BACKENDS if not backend.availability)
+BACKENDS = tuple(backend.name for backend in backends.BACKENDS if not backend.needs_hardware)
 # Of laws small enough for Triton's interpreter, which takes the GPU's part where there is none.
 _INTERPRETED = "gpu" not in BACKENDS and importlib.util.find_spec("triton") is not None
 LIGHT_BACKENDS = (*BACKENDS, "gpu") if _INTERPRETED else BACKENDS

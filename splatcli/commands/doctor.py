@@ -9,7 +9,6 @@ import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from pkgutil import resolve_name
 
 import typer
 from PIL import Image
@@ -140,7 +139,7 @@ def _backend(backend: Backend) -> Check:
     try:
         if why := backend.why_unavailable():
             return Check(label, f"not chosen: {why}", advice=_BACKEND_ADVICE)
-        resolve_name(backend.rasteriser)
+        backend.create()
     except Exception as error:
         return Check(label, f"not present ({reason_of(error)})", ok=False)
     return Check(label, "present")

@@ -2,13 +2,13 @@
 
 To add a backend: write a class with the methods of `definition.Rasteriser` and add one row to
 `BACKENDS`. A backend that also has training kernels gets a row in `train.steps.step`; the others
-train through `forward` and `backward`. Modules named in the list are imported at first use.
+train through `forward` and `backward`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 from stages.base.errors import SplatError
@@ -26,58 +26,64 @@ CPU = "cpu"  # what a manifest calls the hardware of a backend without a descrip
 class Backend:
     """One row of the list.
 
-    Functions and classes are named as "module:attribute".
-
     Args:
         name: as given to --backend.
-        rasteriser: the class that draws.
+        create: makes a new rasteriser. Raises SplatError if the hardware that it needs is absent.
         summary: a few words for the help text.
-        availability: function that returns why "auto" must skip the backend on this machine, or ""
-            if it can be used. Empty for a backend that always runs.
-        description: function that describes the hardware; empty for the CPU.
+        why_unavailable: why "auto" must skip the backend on this machine; "" if it may take it.
+        describe: the hardware that it runs on, for a manifest. Raises as `create`.
+        needs_hardware: whether it runs on some machines only.
     """
 
     name: str
-    rasteriser: str
+    create: Callable[[], Rasteriser]
     summary: str
-    availability: str = ""
-    description: str = ""
-
-    def describe(self) -> str:
-        """The hardware that it runs on, for a manifest. Raises SplatError where it is absent."""
-        return str(resolve_name(self.description)()) if self.description else CPU
-
-    def create(self) -> Rasteriser:
-        """A new rasteriser. Raises SplatError if the hardware that it needs is absent."""
-        rasteriser: Rasteriser = resolve_name(self.rasteriser)()
-        return rasteriser
+    why_unavailable: Callable[[], str] = str
+    describe: Callable[[], str] = lambda: CPU
+    needs_hardware: bool = False
 
     def require(self) -> None:
-        """Raises SplatError if the hardware that it needs is absent. Imports no more than that
-        check needs."""
-        if self.availability:
+        """Raises SplatError if the hardware that it needs is absent."""
+        if self.needs_hardware:
             self.create()
 
-    def why_unavailable(self) -> str:
-        """Why "auto" does not choose it on this machine; "" if it may."""
-        return str(resolve_name(self.availability)()) if self.availability else ""
+
+# Each imports its module when it is called: they load torch, which the list does without.
+def _gpu() -> Rasteriser:
+    from stages.raster.gpu.rasteriser import GpuRasteriser
+
+    return GpuRasteriser()
+
+
+def _why_no_gpu() -> str:
+    from stages.raster.gpu import device
+
+    return device.why_unavailable()
+
+
+def _gpu_description() -> str:
+    from stages.raster.gpu import device
+
+    return device.describe()
+
+
+def _cpu() -> Rasteriser:
+    from stages.raster.cpu.rasteriser import CpuRasteriser
+
+    return CpuRasteriser()
+
+
+def _reference() -> Rasteriser:
+    from stages.raster.reference_rasteriser import ReferenceRasteriser
+
+    return ReferenceRasteriser()
 
 
 # "auto" takes the first that is available.
 BACKENDS = (
-    Backend(
-        "gpu",
-        "stages.raster.gpu.rasteriser:GpuRasteriser",
-        "Triton kernels",
-        availability="stages.raster.gpu.device:why_unavailable",
-        description="stages.raster.gpu.device:describe",
-    ),
-    Backend("cpu", "stages.raster.cpu.rasteriser:CpuRasteriser", "compiled kernels"),
-    Backend(
-        "reference",
-        "stages.raster.reference_rasteriser:ReferenceRasteriser",
-        "torch, slow",
-    ),
+    Backend("gpu", _gpu, "Triton kernels", _why_no_gpu, _gpu_description, needs_hardware=True),
+    Backend("cpu", _cpu, "compiled kernels"),
+    Backend("reference", _reference, "torch, slow"),
 )
 CHOICES = (AUTO, *(backend.name for backend in BACKENDS))
 

@@ -36,16 +36,17 @@ def test_every_backend_in_the_list_has_the_gradients_of_the_definition(name: str
 
 def test_a_backend_that_returns_zeros_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """It would pass a test that ran other kernels in its place."""
-    fake = Backend("zeros", f"{__name__}:Zeros", "for this test")
+    fake = Backend("zeros", Zeros, "for this test")
     monkeypatch.setattr(backends, "BACKENDS", (*backends.BACKENDS, fake))
     assert worst_gradient("zeros") > 0.5
 
 
 def test_a_backend_takes_part_in_training_without_a_step_of_its_own(monkeypatch) -> None:
+    from stages.raster.reference_rasteriser import ReferenceRasteriser
     from stages.train.steps.reference import ReferenceStep
     from stages.train.steps.step import step_of
 
-    fake = Backend("another", "stages.raster.reference_rasteriser:ReferenceRasteriser", "a test")
+    fake = Backend("another", ReferenceRasteriser, "a test")
     monkeypatch.setattr(backends, "BACKENDS", (*backends.BACKENDS, fake))
     assert isinstance(step_of("another"), ReferenceStep)
 
