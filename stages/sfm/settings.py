@@ -25,9 +25,8 @@ class SfmSettings:
     )
     matching: str = setting(
         "auto",
-        "Pairs of photographs to match: exhaustive (every pair), sequential "
-        "(neighbours in order of name) or auto (those with similar features).",
-        choices=("auto", "exhaustive", "sequential"),
+        "Pairs of photographs to match: auto (those with similar features) or exhaustive (all).",
+        choices=("auto", "exhaustive"),
     )
     features: str = setting(
         "auto",

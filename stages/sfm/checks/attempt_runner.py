@@ -28,15 +28,7 @@ from stages.sfm.checks.gates import (
 )
 from stages.sfm.checks.statistics import model_statistics
 from stages.sfm.worker import database as sqlite
-from stages.sfm.worker.job import (
-    Features,
-    Job,
-    Learned,
-    Mapping,
-    Matching,
-    Project,
-    Sift,
-)
+from stages.sfm.worker.job import Features, Job, Learned, Mapping, Matching, Project, Sift
 from stages.sfm.worker.process import WorkerCrashed, WorkerTimedOut, run_step
 from stages.sfm.worker.sparse_model import load_result, without_implausible_views
 

@@ -1,5 +1,5 @@
-"""A reconstruction from known cameras: pinhole pictures, poses checked against matches, points from
-the camera file, from matches with the poses held fixed, or at random."""
+"""A reconstruction from known cameras: pinhole pictures, poses checked against matches, and points
+from the camera file, or from matches with the poses held fixed."""
 
 from __future__ import annotations
 
@@ -21,8 +21,7 @@ from stages.base.text import counted
 from stages.cameras.camera_file import FilePoints
 from stages.cameras.camera_formats import read_cameras, read_points
 from stages.cameras.colmap import Observations
-from stages.cameras.undistortion import undistorted_camera
-from stages.scene import Camera, Capture, Photo, Reconstruction
+from stages.scene import Capture, Photo, Reconstruction
 from stages.scene.rotations import quaternions_of
 from stages.sfm.finish import COLMAP, write_reconstruction
 from stages.sfm.known.epipolar import PoseCheck
@@ -97,8 +96,8 @@ def reconstruct(
     _check_poses(PoseCheck(**check), settings, report)
     if settings.refine_cameras:
         views = chosen = _refined(views, out / POINTS, report)  # none is for testing
-    whole = _whole(chosen, posed)
-    cloud, observed = find_points(from_file, out / POINTS, chosen, whole, settings.seed, report)
+    cameras = [view.camera for view in chosen]
+    cloud, observed = find_points(from_file, out / POINTS, cameras, report)
     observed = replace(observed, views=np.array(training, np.int32)[observed.views])
     scale = KnownScale(
         settings.scale, settings.marker, settings.crs, settings.metres, found.georeference
@@ -106,20 +105,6 @@ def reconstruct(
     done = _finish(views, cloud, observed, scale, folder, report)
     with_roles = zip(done.views, roles, strict=True)
     return replace(done, views=tuple(replace(view, role=role) for view, role in with_roles))
-
-
-def _whole(views: Sequence[PinholeView], posed: Sequence[PosedPhoto]) -> list[Camera]:
-    """[V] a pinhole camera for the photograph of each view: along the photograph's own axis, and as
-    wide as one pinhole picture can be."""
-    cameras = []
-    for view in views:
-        camera = view.camera
-        if view.photo.face:
-            taken = posed[view.number]
-            pose = _of_photograph(view)
-            camera = replace(undistorted_camera(taken.camera, taken.lens), world_to_camera=pose)
-        cameras.append(camera)
-    return cameras
 
 
 def _of_photograph(view: PinholeView) -> NDArray[np.float64]:

@@ -20,12 +20,7 @@ from stages.base import memory
 from stages.base.memory import MIB
 from stages.sfm.worker import database as sqlite
 from stages.sfm.worker import new_database
-from stages.sfm.worker.job import (
-    Features,
-    Photographs,
-    Project,
-    Sift,
-)
+from stages.sfm.worker.job import Features, Photographs, Project, Sift
 from stages.sfm.worker.progress import ProgressWriter
 
 LARGEST_SIDE = 3200  # pixels; features of larger photographs are found at this size

@@ -134,7 +134,7 @@ class Features(Job):
 
 @dataclass(frozen=True)
 class Matching(Job):
-    """Match and verify pairs. how: "auto" (pairs that look alike), "exhaustive" or "sequential"."""
+    """Match and verify pairs. how: "auto" (pairs that look alike) or "exhaustive"."""
 
     step = "matching"
     how: str

@@ -76,8 +76,6 @@ def _rounds(
     frames = project.photographs.frames
     if how == "exhaustive":
         yield pairs.pairs_of_faces(pairs.exhaustive_pairs(int(frames.max()) + 1), frames)
-    elif how == "sequential":
-        yield pairs.pairs_of_faces(pairs.sequential_pairs(int(frames.max()) + 1), frames)
     else:
         similarity = _similarity(project, features)
         first = [(i, j) for i, j in pairs.initial_pairs(similarity) if frames[i] != frames[j]]

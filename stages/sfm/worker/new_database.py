@@ -45,8 +45,8 @@ def create(path: Path, photographs: Photographs) -> None:
 
 
 def _write_rigs(database: pycolmap.Database, cameras: Sequence[CameraGuess]) -> list[int]:
-    """Write cameras and rigs; returns the id of each camera's rig: its own id, or that of the first
-    camera of a panorama's rig, which is the rig's reference."""
+    """Write cameras and rigs; returns the id of each camera's rig. A rig has the id of its first
+    camera, which is its reference."""
     rig_of: list[int] = []
     first: dict[str, int] = {}
     rigs: dict[int, pycolmap.Rig] = {}

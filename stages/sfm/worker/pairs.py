@@ -12,7 +12,6 @@ from stages.sfm.checks.gates import connected_groups
 
 Pair = tuple[int, int]
 
-NEIGHBOURS = 20  # in the capture's order, for sequential matching; besides those 32, 64, ... apart
 BEST = 14  # pairs for each photograph
 FEWEST_SIMILAR = 4  # matches of the largest features; unrelated pairs have fewer
 LINK_INLIERS = 30
@@ -28,12 +27,6 @@ SUPPORTING = 4
 def exhaustive_pairs(photographs: int) -> list[Pair]:
     """All pairs."""
     return list(itertools.combinations(range(photographs), 2))
-
-
-def sequential_pairs(photographs: int) -> list[Pair]:
-    """Neighbours in the capture's order, and some that are farther apart."""
-    steps = [*range(1, NEIGHBOURS + 1), *(2**k for k in range(5, photographs.bit_length()))]
-    return sorted((i, i + step) for step in steps for i in range(photographs - step))
 
 
 def pairs_of_faces(frame_pairs: Iterable[Pair], frames: NDArray[np.int64]) -> list[Pair]:

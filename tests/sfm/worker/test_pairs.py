@@ -19,13 +19,6 @@ def test_exhaustive_pairs_hold_every_pair_once() -> None:
     assert pairs.exhaustive_pairs(4) == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
 
 
-def test_sequential_pairs_are_neighbours_and_some_far_ones() -> None:
-    found = pairs.sequential_pairs(200)
-    assert len(set(found)) == len(found)
-    assert all(0 <= first < second < 200 for first, second in found)
-    assert {second - first for first, second in found} == {*range(1, 21), 32, 64, 128}
-
-
 def test_a_loop_is_matched_along_it_and_where_it_closes() -> None:
     found = pairs.initial_pairs(around(300))
     assert (0, 299) in found
