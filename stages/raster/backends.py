@@ -16,7 +16,7 @@ from stages.base.settings import setting
 
 if TYPE_CHECKING:
     from stages.base.stage import Report
-    from stages.raster.definition import Rasteriser
+    from stages.raster.definition import Rasteriser  # loads torch, the list does not
 
 AUTO = "auto"
 CPU = "cpu"  # what a manifest calls the hardware of a backend without a description
@@ -48,33 +48,34 @@ class Backend:
             self.create()
 
 
-# Each imports its module when it is called: they load torch, which the list does without.
 def _gpu() -> Rasteriser:
-    from stages.raster.gpu.rasteriser import GpuRasteriser
+    from stages.raster.gpu.rasteriser import GpuRasteriser  # loads torch, the list does not
 
     return GpuRasteriser()
 
 
 def _why_no_gpu() -> str:
-    from stages.raster.gpu import device
+    from stages.raster.gpu import device  # loads torch, the list does not
 
     return device.why_unavailable()
 
 
 def _gpu_description() -> str:
-    from stages.raster.gpu import device
+    from stages.raster.gpu import device  # loads torch, the list does not
 
     return device.describe()
 
 
 def _cpu() -> Rasteriser:
-    from stages.raster.cpu.rasteriser import CpuRasteriser
+    from stages.raster.cpu.rasteriser import CpuRasteriser  # loads torch, the list does not
 
     return CpuRasteriser()
 
 
 def _reference() -> Rasteriser:
-    from stages.raster.reference_rasteriser import ReferenceRasteriser
+    from stages.raster.reference_rasteriser import (
+        ReferenceRasteriser,
+    )  # loads torch, the list does not
 
     return ReferenceRasteriser()
 

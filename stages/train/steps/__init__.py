@@ -4,7 +4,7 @@
 <<<<<<< HEAD
 fast ones, by `loss_kernels` and `gpu_kernels`; `device_model` is what `gpu` gives to the rules.
 =======
-fast ones, by `loss_kernels` and `gpu_kernels`; `device_model` is what `gpu` hands to the rules.
+fast ones, by `loss_kernels` and `gpu_kernels`; `device_model` is what `gpu` gives to the rules.
 >>>>>>> 4b23f78b (A docstring within the line length)
 `memory_limited` continues with fewer splats.
 """
