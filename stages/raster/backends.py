@@ -73,9 +73,8 @@ def _cpu() -> Rasteriser:
 
 
 def _reference() -> Rasteriser:
-    from stages.raster.reference_rasteriser import (
-        ReferenceRasteriser,
-    )  # loads torch, the list does not
+    # loads torch, the list does not
+    from stages.raster.reference_rasteriser import ReferenceRasteriser
 
     return ReferenceRasteriser()
 
