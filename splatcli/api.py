@@ -20,7 +20,7 @@ from stages.raster.definition import Rendering
 from stages.raster.draw import render
 from stages.run import results, runfolder
 from stages.run.listener import Listener
-from stages.run.manifest import plain
+from stages.run.manifest import json_value
 from stages.run.pipeline import Pipeline
 from stages.run.stages import STAGE_NAMES, STAGE_OF, options_of
 from stages.scene import Camera, ExportedAssets, Reconstruction, Splats
@@ -132,7 +132,7 @@ class _Calling(Listener):
         self._call = call
 
     def progressed(self, stage: Stage, label: str, done: int, total: int, numbers: Numbers) -> None:
-        self._call(Progress(stage.name, label, done, total, plain(numbers)))
+        self._call(Progress(stage.name, label, done, total, json_value(numbers)))
 
 
 def process(

@@ -23,7 +23,7 @@ from rich.text import Text
 from splatcli import console
 from stages.base.stage import Numbers, Stage
 from stages.run.listener import Listener
-from stages.run.manifest import Manifest, plain
+from stages.run.manifest import Manifest, json_value
 
 _LINE_EVERY_S = 10.0
 _EVENT_EVERY_S = 0.5
@@ -72,7 +72,7 @@ class Events(Listener):
         if now - self._last >= _EVENT_EVERY_S or done >= total:
             self._last = now
             values: dict[str, Any] = {"label": label, "done": done, "total": total}
-            console.emit("progress", stage=stage.name, **values, numbers=plain(numbers))
+            console.emit("progress", stage=stage.name, **values, numbers=json_value(numbers))
 
     def finished(self, stage: Stage, number: int, manifest: Manifest) -> None:
         console.emit("finished", stage=stage.name, **result_of(manifest))
@@ -85,7 +85,7 @@ class Events(Listener):
 
 
 def result_of(manifest: Manifest) -> dict[str, Any]:
-    """Costs, metrics and warnings of a finished stage as plain data."""
+    """Costs, metrics and warnings of a finished stage as JSON data."""
     return {
         "seconds": manifest.seconds,
         "cpu_seconds": manifest.cpu_seconds,

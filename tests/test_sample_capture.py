@@ -15,7 +15,7 @@ from PIL import Image
 
 from sample_captures import make
 from sample_captures.render import Lens, Light, photograph
-from stages.run.manifest import plain
+from stages.run.manifest import json_value
 from stages.scene import Reconstruction
 from stages.scene.rotations import similarity
 from stages.sfm import stage as sfm
@@ -82,7 +82,7 @@ def test_a_rendering_from_the_truth_looks_like_the_photograph() -> None:
 def reconstruction(sample_run: Path) -> Reconstruction:
     """Of the whole capture, with the settings that everyone has."""
     settings = json.loads((sample_run / "run" / "2-sfm" / "manifest.json").read_text())["settings"]
-    assert settings == plain(asdict(SfmSettings()))
+    assert settings == json_value(asdict(SfmSettings()))
     return sfm.load(sample_run / "run" / "2-sfm")
 
 

@@ -45,7 +45,7 @@ class SplatError(Exception):
         self.family = family or type(self).family
 
     def as_dict(self) -> dict[str, str | int]:
-        """The error as plain data, for `--json`."""
+        """The error as JSON data, for `--json`."""
         return {
             "code": self.code,
             "given": self.given,

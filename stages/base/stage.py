@@ -1,6 +1,6 @@
 """The interface of a stage, and the report that it fills while it runs.
 
-A stage knows nothing of manifests, skipping or the terminal. Tests call `stage.run` with a plain
+A stage knows nothing of manifests, skipping or the terminal. Tests call `stage.run` with a
 `Report` and a folder of their own.
 """
 
@@ -28,7 +28,7 @@ class Report:
     """Collects metrics, warnings and progress of one run of a stage.
 
     Attributes:
-        metrics: plain JSON values, written to the manifest.
+        metrics: JSON values, written to the manifest.
         warnings: (code, message) pairs; the message is a full sentence with advice.
         listener: called with each progress report.
         stop_requested: set from outside (Ctrl-C). Long stages check it at each step boundary,

@@ -245,18 +245,18 @@ def psnr_as_taken_db(
         The mean PSNR of the drawings as they are, and that of their right halves after an affine
         map of each channel that was fitted to the left halves.
     """
-    plain, adapted = [], []
+    unadapted, adapted = [], []
     as_taken = replace(draw_settings, light=False, vignetting=False)
     for view in load_evaluation_views(folder, views, as_taken):
         image, truth = np.clip(draw(view.camera), 0.0, 1.0), view.image
         half, everywhere = truth.shape[1] // 2, np.ones(truth.shape[:2], bool)
         valid = everywhere if view.valid is None else view.valid
-        plain.append(capped_psnr_db(image, truth, valid))
+        unadapted.append(capped_psnr_db(image, truth, valid))
         left, right = valid.copy(), valid.copy()
         left[:, half:], right[:, :half] = False, False
         if left.sum() > 1 and right.any():
             adapted.append(capped_psnr_db(_affinely_mapped(image, truth, left), truth, right))
-    return float(np.mean(plain)), float(np.mean(adapted)) if adapted else 0.0
+    return float(np.mean(unadapted)), float(np.mean(adapted)) if adapted else 0.0
 
 
 def _affinely_mapped(

@@ -38,14 +38,14 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
     write_file(Path(path), primitives, splats, units)
 
 
-def plain(name: str, values: NDArray[np.float32]) -> Attribute:
+def floats(name: str, values: NDArray[np.float32]) -> Attribute:
     """An attribute as float32."""
     return Attribute(values.astype("<f4"), values.shape[1])
 
 
 def attributes(
     splats: Splats,
-    encoded: Callable[[str, NDArray[np.float32]], Attribute] = plain,
+    encoded: Callable[[str, NDArray[np.float32]], Attribute] = floats,
     colour_type: str = "<u2",
     unit: float = 1.0,
 ) -> dict[str, Attribute]:
@@ -69,7 +69,7 @@ def attributes(
         "OPACITY": opacities[:, None],
     }
     return {
-        "POSITION": plain("POSITION", y_up.means / np.float32(unit)),
+        "POSITION": floats("POSITION", y_up.means / np.float32(unit)),
         "COLOR_0": Attribute(colours, 4),
         **{f"{EXTENSION}:{name}": encoded(name, array) for name, array in values.items()},
         **_sh_attributes(splats),

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.formats.gltf import attributes, plain
+from stages.formats.gltf import attributes, floats
 from stages.formats.gltf_file import Attribute, write_file
 from stages.formats.values import linear_scales
 from stages.scene import Splats
@@ -71,7 +71,7 @@ def _attributes(splats: Splats, unit: float | None) -> dict[str, Attribute]:
         if name == "OPACITY":
             return Attribute(_padded(np.rint(float(_U16) * values).astype("<u2"), 2), 1)
         if unit is None:
-            return plain(name, values)
+            return floats(name, values)
         # never 0, which some viewers take for a flat splat
         steps = np.maximum(np.rint(values / np.float64(unit) * _U16), 1)
         return Attribute(_padded(steps.astype("<u2"), 4), 3)

@@ -73,10 +73,10 @@ def read(path: Path) -> Splats:
     Raises BadFileError for a damaged file or another version.
     """
     with path.open("rb") as file:
-        plain = file.read(len(MAGIC)) == MAGIC
+        streams = file.read(len(MAGIC)) == MAGIC
         file.seek(0)
         size = path.stat().st_size
-        head, extensions, arrays = _plain(file, size) if plain else _gzipped(file, size)
+        head, extensions, arrays = _of_streams(file, size) if streams else _gzipped(file, size)
         y_up = _is_y_up(extensions) if head.flags & _HAS_EXTENSIONS else True
         splats = _decoded(head, arrays).with_antialias(bool(head.flags & ANTIALIASED))
         return flipped(splats, reuse=True) if y_up else splats
@@ -94,7 +94,7 @@ def _gzipped(file: BinaryIO, size: int) -> _Content:
     return head, read_rest(stream), arrays
 
 
-def _plain(file: BinaryIO, size: int) -> _Content:
+def _of_streams(file: BinaryIO, size: int) -> _Content:
     head, extensions, table = _table(file, size)
     sizes, count = head.widths, head.splats
     check_size(count * sum(sizes), size)

@@ -153,5 +153,5 @@ def _write_package(path: Path, splats: Splats, units: str, name: str) -> None:
 
 def _archive_name(name: str) -> str:
     """An ASCII name: brackets separate names inside packages, and zip has several encodings."""
-    plain = "".join(c if c.isascii() and (c.isalnum() or c in "-_.") else "_" for c in name)
-    return plain.lstrip(".") or "scene.usdc"
+    ascii_name = "".join(c if c.isascii() and (c.isalnum() or c in "-_.") else "_" for c in name)
+    return ascii_name.lstrip(".") or "scene.usdc"

@@ -27,7 +27,7 @@ _SHARE = 0.95  # of the pixels outside the circles that are dark, and just insid
 EQUIRECTANGULAR = "equirectangular"
 SPHERE = "a 360-degree panorama (equirectangular)"
 _FISHEYES = "a pair of fisheye pictures side by side"
-WHOLE = "Export the whole sphere, twice as wide as high, or photograph with a plain lens"
+WHOLE = "Export the whole sphere, twice as wide as high, or photograph with an ordinary lens"
 STITCH = (
     "Stitch it in the camera manufacturer's program, and export it equirectangular: twice as wide "
     "as high"

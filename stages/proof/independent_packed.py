@@ -1,4 +1,4 @@
-"""Independent readers of the packed formats: plyfile, gzip, zipfile and Pillow, and plain
+"""Independent readers of the packed formats: plyfile, gzip, zipfile and Pillow, and our
 arithmetic. They share no code with `stages.formats`."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The definition of a rendering, in plain torch: any dtype, any device, autograd.
+"""The definition of a rendering, in torch: any dtype, any device, autograd.
 
 Every backend is compared with this file in tests. It is written for clarity, not for speed.
 

@@ -19,7 +19,7 @@ from stages.base.text import reason_of
 from stages.run.digests import combined_digest, record_files
 from stages.run.failures import as_splat_error
 from stages.run.listener import Listener
-from stages.run.manifest import Manifest, plain, write_json
+from stages.run.manifest import Manifest, json_value, write_json
 from stages.run.request import Request
 from stages.run.workspace import BOOKKEEPING, USAGE, Workspace
 
@@ -91,7 +91,7 @@ def _manifest(request: Request, report: Report, folder: Path, usage: _Usage) -> 
         device=report.device,
         seed=request.settings.get("seed"),
         libraries=versions(),
-        metrics=plain(report.metrics),
+        metrics=json_value(report.metrics),
         warnings=[list(pair) for pair in report.warnings],
     )
 

@@ -32,7 +32,7 @@ class Manifest:
 
     Args:
         stage, version: the stage's name and version.
-        settings: all settings, as plain data.
+        settings: all settings, as JSON data.
         inputs: digest of each input by name.
         outputs: record of each output file by name.
         output_digest: one digest over names and contents of the outputs.
@@ -44,7 +44,7 @@ class Manifest:
         input_files: for inputs that are the user's own files, the record of each file, so that
             the one that changed can be named.
         libraries: versions by distribution name.
-        metrics: plain figures from the stage.
+        metrics: JSON values from the stage.
         warnings: (code, sentence) pairs.
     """
 
@@ -86,15 +86,15 @@ class Manifest:
             raise edited(folder / MANIFEST) from error
 
 
-def plain(value: Any) -> Any:
+def json_value(value: Any) -> Any:
     """`value` as JSON data: arrays and tuples as lists, numpy scalars as numbers, infinity and NaN
     as the strings "inf", "-inf" and "nan", which JSON numbers cannot express."""
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): json_value(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
+        return [json_value(item) for item in value]
     if hasattr(value, "tolist"):  # numpy, without importing it
-        return plain(value.tolist())
+        return json_value(value.tolist())
     if isinstance(value, bool) or value is None or isinstance(value, (int, str)):
         return value
     if isinstance(value, float):
@@ -109,7 +109,7 @@ def write_json(path: Path, data: Mapping[str, Any]) -> None:
     """
     temporary = path.with_name(path.name + ".tmp")
     with temporary.open("w", encoding="utf-8") as file:
-        json.dump(plain(data), file, indent=1)
+        json.dump(json_value(data), file, indent=1)
         file.write("\n")
         file.flush()
         os.fsync(file.fileno())
@@ -119,7 +119,7 @@ def write_json(path: Path, data: Mapping[str, Any]) -> None:
 
 def write_sealed(path: Path, data: Mapping[str, Any]) -> None:
     """Write JSON with the schema version and a digest of the contents added. Raises OSError."""
-    body = {"schema": SCHEMA, **plain(data)}
+    body = {"schema": SCHEMA, **json_value(data)}
     write_json(path, {**body, "digest": _seal(body)})
 
 

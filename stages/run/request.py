@@ -15,14 +15,14 @@ from stages.base.settings import settings_of
 from stages.base.stage import Stage
 from stages.base.text import counted
 from stages.run.digests import FileRecords, differences
-from stages.run.manifest import Manifest, plain, write_json
+from stages.run.manifest import Manifest, json_value, write_json
 
 REQUEST = "request.json"
 
 
 @dataclass(frozen=True)
 class Request:
-    """stage: which code runs. settings: plain data. inputs: digest by name. input_files: records of
+    """stage: which code runs. settings: JSON data. inputs: digest by name. input_files: records of
     the user's own files behind an input."""
 
     stage: Stage
@@ -31,7 +31,7 @@ class Request:
     input_files: dict[str, FileRecords]
 
     def key(self) -> dict[str, Any]:
-        """What must be equal to resume an interrupted attempt, as plain data. Settings that do not
+        """What must be equal to resume an interrupted attempt, as JSON data. Settings that do not
         affect the output, and those that may change on resuming ("midway"), are left out."""
         every = settings_of(self.stage.settings_type)
         free = {one.name for one in every if one.midway or not one.affects_output}
@@ -53,7 +53,7 @@ class Request:
 
 def settings_to_data(settings: Any) -> dict[str, Any]:
     """A settings dataclass as JSON holds it."""
-    data: dict[str, Any] = plain(asdict(settings))
+    data: dict[str, Any] = json_value(asdict(settings))
     return data
 
 

@@ -24,7 +24,7 @@ RUN_FILE = "run.json"
 
 @dataclass(frozen=True)
 class RunFile:
-    """photographs: absolute path. settings: plain data by stage name. rebuilt: whether it was read
+    """photographs: absolute path. settings: JSON data by stage name. rebuilt: whether it was read
     from the stages' folders, because `run.json` is missing or damaged."""
 
     photographs: Path | None = None

@@ -1,4 +1,4 @@
-"""Gaussian splats as plain arrays, and their quantised form."""
+"""Gaussian splats as arrays, and their quantised form."""
 
 from __future__ import annotations
 

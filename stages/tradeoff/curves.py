@@ -1,4 +1,4 @@
-"""The measurements behind a trade-off report as plain values, and how its curves are read."""
+"""The measurements behind a trade-off report as values, and how its curves are read."""
 
 from __future__ import annotations
 

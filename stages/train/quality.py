@@ -52,8 +52,8 @@ def write_quality(
         )
     if (draw_settings.light or draw_settings.vignetting) and scores:
         _, held = split_held_out(reconstruction.views)
-        plain, adapted = psnr_as_taken_db(render, reconstruction.folder, held, draw_settings)
-        report.metric("psnr_as_taken_db", round(plain, 3))
+        unadapted, adapted = psnr_as_taken_db(render, reconstruction.folder, held, draw_settings)
+        report.metric("psnr_as_taken_db", round(unadapted, 3))
         report.metric("psnr_adapted_db", round(adapted, 3))
     inside = psnr_inside_masks_db(render, views)
     if inside is not None:

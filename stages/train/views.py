@@ -61,7 +61,7 @@ class Level:
         return cls(camera, planar, channel_means(planar), mask, outside, light)
 
     @property
-    def plain(self) -> bool:
+    def unchanged(self) -> bool:
         """Whether the pixels are the target of a render without changes."""
         return self.mask is None and self.light is None
 
@@ -146,7 +146,7 @@ def target_of(
 ) -> NDArray[np.uint8] | NDArray[np.float32]:
     """[3, H, W] the target for `image` [>= 3, H, W], which was rendered over `background`: the
     photograph's bytes where nothing has to be done, else float32, mostly in 0..1."""
-    if level.plain:
+    if level.unchanged:
         return level.pixels
     pixels, overexposed, uncovered = evened(level)
     if overexposed is not None:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from stages.base.errors import SplatError
 from stages.run.digests import FileRecord, combined_digest, differences, record_files
-from stages.run.manifest import SCHEMA, plain, read_sealed, write_sealed
+from stages.run.manifest import SCHEMA, json_value, read_sealed, write_sealed
 
 values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
@@ -24,7 +24,7 @@ values = st.recursive(
 
 @given(values)
 def test_plain_values_survive_json(value: object) -> None:
-    once = plain(value)
+    once = json_value(value)
     assert json.loads(json.dumps(once, allow_nan=False)) == once
 
 
@@ -37,7 +37,7 @@ def test_plain_takes_what_stages_report() -> None:
         "endless": math.inf,
         1: (True, None),
     }
-    assert plain(reported) == {
+    assert json_value(reported) == {
         "psnr_db": 27.5,
         "count": 3,
         "list": [0, 1],

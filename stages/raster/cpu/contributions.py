@@ -52,7 +52,7 @@ from stages.raster.kernels.simd import (
 
 _F = np.float32
 _ALPHA_MIN, _ALPHA_MAX = _F(ALPHA_MIN), _F(ALPHA_MAX)
-# Planes of the work: residual, colour behind the splat, light behind it.
+# Planes of the work: residual, colour behind the splat, transmittance there.
 RESIDUAL, BEHIND, PASSING = 0, 3 * PIXELS, 6 * PIXELS
 
 

@@ -124,7 +124,7 @@ class CpuRasteriser:
             raise _lists_too_large(error, camera, arrays[2][visible]) from error
         background = np.asarray(settings.background, np.float32)
         n_tiles = len(lists[0]) - 1
-        transmittance = get("light", (n_tiles, PIXELS), np.float32)
+        transmittance = get("transmittance", (n_tiles, PIXELS), np.float32)
         last = get("last", (n_tiles, PIXELS), np.float32)
         rest = (geometry, paint, background, transmittance, last)
         tiles = DrawnTiles._make((width, height, *lists, *rest))

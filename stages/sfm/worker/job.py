@@ -200,12 +200,12 @@ class Triangulation(Job):
 def _encoded(value: object) -> str:
     """As JSON."""
 
-    def plain(part: Any) -> Any:
+    def json_value(part: Any) -> Any:
         if isinstance(part, np.ndarray):
             return part.tolist()
         return str(part) if isinstance(part, Path) else vars(part)
 
-    return json.dumps(value, default=plain, sort_keys=True)
+    return json.dumps(value, default=json_value, sort_keys=True)
 
 
 def _decoded(kind: Any, value: Any) -> Any:

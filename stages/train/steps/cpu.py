@@ -26,7 +26,7 @@ class CpuStep(HostStep):
             self._v_image = np.empty(level.pixels.shape, np.float32)
         forward = self.rasteriser.forward(self.arrays(given), level.camera, settings)
         target = target_of(level, forward.image, settings.background)
-        means = level.means if level.plain else None
+        means = level.means if level.unchanged else None
         loss = image_loss(pool, forward.image, target, self._v_image, means=means)
         if given.weight != 1.0:
             self._v_image *= np.float32(given.weight)

@@ -109,7 +109,7 @@ class GpuTarget:
 
     def target(self, image: Tensor, background: Colour) -> tuple[Tensor, Tensor]:
         """(the target for `image` [>= 3, H, W], the means of its channels)."""
-        if self.level.plain:
+        if self.level.unchanged:
             return self.pixels, self.means
         target = self.pixels
         if self.overexposed is not None:
@@ -133,7 +133,7 @@ def gpu_target_of(level: Level, device: torch.device) -> GpuTarget:
     def sent(array: Any) -> Any:
         return None if array is None else torch.tensor(array, device=device)
 
-    if level.plain:
+    if level.unchanged:
         return GpuTarget(level, sent(level.pixels), sent(level.means))
     pixels, overexposed, uncovered = map(sent, evened(level))
     ignores = level.mask is not None and level.outside == IGNORE
