@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.blocks import blocks
+from stages.base.row_slices import row_slices
 from stages.formats.values import empty_rows
 from stages.raster.definition import ALPHA_MAX
 from stages.scene import SH_C0, Splats, logit, morton
@@ -114,7 +114,7 @@ def _partners(
         cheapest[to][better] = cost[better]
         partners[to][better] = to.start + better + step
 
-    for block in blocks(count, _BLOCK):
+    for block in row_slices(count, _BLOCK):
         rows = order[block.start : block.stop + _WINDOW]
         part = Moments.of(splats, rows)
         weights = part.masses if removal is None else removal.weights[rows]
@@ -146,7 +146,7 @@ def _with_merged(
     """The splats at the curve positions `kept`. into [N]: the position of the splat that is merged
     into each one, or -1."""
     arrays = empty_rows(splats, len(kept))
-    for block in blocks(len(kept), _BLOCK):
+    for block in row_slices(len(kept), _BLOCK):
         places = kept[block]
         part = splats.take(order[places])
         pairs = np.flatnonzero(into[places] >= 0)

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from stages import formats
 from stages.base.atomic import partial_prefix
-from stages.base.blocks import blocks
 from stages.base.errors import SplatError, UsageError
+from stages.base.row_slices import row_slices
 from stages.base.text import counted
 from stages.editing import expression, levels, regions, transform
 from stages.editing.decimate import FAR_ROUND_SHARE, NEAR_ROUND_SHARE, decimate
@@ -99,7 +99,7 @@ def _keeping(condition: Callable[[Splats], NDArray[np.bool_]]) -> Operation:
 
     def kept(scene: EditedScene) -> EditedScene:
         found = np.empty(len(scene.splats), bool)
-        for rows in blocks(len(found)):
+        for rows in row_slices(len(found)):
             found[rows] = condition(scene.splats.take(rows))
         return scene.reduced_to(found)
 

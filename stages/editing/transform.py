@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from stages.base import scratch
-from stages.base.blocks import blocks
+from stages.base.row_slices import row_slices
 from stages.raster.sh import sh_basis
 from stages.scene import Camera, Splats
 from stages.scene.recentring import recentred
@@ -68,7 +68,7 @@ class Similarity:
         rotates = not np.array_equal(self.rotation, np.eye(3))
         if rotates and splats.sh_degree:
             sh = scratch.empty(splats.sh.shape, splats.sh.dtype)
-        for rows in blocks(len(splats)):
+        for rows in row_slices(len(splats)):
             with np.errstate(over="ignore"):  # what becomes infinite is left out and counted
                 means[rows] = splats.means[rows].astype(np.float64) @ linear.T + left
             logs[rows] = splats.log_scales[rows] + np.log(self.scale)

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from stages.base.blocks import blocks
+from stages.base.row_slices import row_slices
 from stages.evaluate.contribution import VISIBLE_WEIGHT, Contributions, near_view_frusta
 from stages.scene import Camera, Splats
 
@@ -79,11 +79,11 @@ def isolated_splats(splats: Splats) -> NDArray[np.bool_]:
     tree = KDTree(splats.means.astype(np.float64))
     nearest = np.empty((len(splats), count), np.int32)
     far = np.empty(len(splats))
-    for rows in blocks(len(splats)):
+    for rows in row_slices(len(splats)):
         distances, found = tree.query(splats.means[rows].astype(np.float64), count + 1)
         nearest[rows], far[rows] = found[:, 1:], distances[:, -1]
     isolated = np.empty(len(splats), bool)
-    for rows in blocks(len(splats)):
+    for rows in row_slices(len(splats)):
         usual = np.median(far[nearest[rows]], axis=1)
         reach = _REACH * np.exp(splats.log_scales[rows].max(axis=1).astype(np.float64))
         isolated[rows] = far[rows] > np.maximum(_ISOLATED * usual, reach)

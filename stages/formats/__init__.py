@@ -5,7 +5,7 @@ them so. The axes and encodings of a format stay inside its module.
 
 To add a format, in six steps:
 1. Write `write(path, splats, *, units)` in a module here. Its splats are all drawable. It writes
-   through `base.atomic.replacing`, one block of `base.blocks.blocks` at a time.
+   through `base.atomic.replacing`, one slice of `base.row_slices.row_slices` at a time.
 2. Write `read(path)` in the same module, or in one beside it. It raises
    `base.bad_files.BadFileError`, or what damaged bytes cause in Python and NumPy; `formats.read`
    turns both into SplatError, and checks the values.

@@ -11,7 +11,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.blocks import blocks
+from stages.base.row_slices import row_slices
 from stages.formats.values import unit_quaternions
 from stages.scene import Splats
 from stages.scene.rotations import matrices_of
@@ -24,7 +24,7 @@ def smallest_rotations(splats: Splats) -> Splats:
     cube = _cube_rotations()
     # each column of a rotation matrix selects the old axis that becomes the new one
     axes = np.abs(matrices_of(cube)).argmax(axis=1)
-    for rows in blocks(len(splats)):
+    for rows in row_slices(len(splats)):
         rotations = unit_quaternions(splats.quaternions[rows]).astype(np.float64)
         least = np.abs(rotations @ (cube * (1, -1, -1, -1)).T).argmax(axis=1)
         found = _product(rotations, cube[least])

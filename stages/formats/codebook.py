@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base import scratch
-from stages.base.blocks import blocks
+from stages.base.row_slices import row_slices
 
 SIZE = 256
 _SCALAR_ROUNDS, _VECTOR_ROUNDS = 30, 6
@@ -52,7 +52,7 @@ def _prefix_sums(ordered: NDArray[np.floating], power: int) -> NDArray[np.float6
     """[M + 1] prefix sums of the values to the power 1 or 2."""
     sums = scratch.empty((len(ordered) + 1,), np.float64)
     sums[0] = 0
-    for rows in blocks(len(ordered)):
+    for rows in row_slices(len(ordered)):
         part = sums[rows.start : rows.stop + 1]  # begins with the sum so far
         np.power(ordered[rows], power, out=part[1:], dtype=np.float64)
         np.cumsum(part, out=part)
@@ -63,7 +63,7 @@ def nearest(codebook: NDArray[np.float64], values: NDArray[np.floating]) -> NDAr
     """The index of the nearest codebook entry, in the shape of `values`."""
     middles = (codebook[1:] + codebook[:-1]) / 2
     indices = np.empty(values.shape, np.uint8)
-    for rows in blocks(len(values)):
+    for rows in row_slices(len(values)):
         indices[rows] = np.searchsorted(middles, values[rows].astype(np.float64))
     return indices
 
@@ -84,19 +84,21 @@ def vector_palette(
             return vectors[first[order]], np.argsort(order)[which]
     labels = np.zeros(len(vectors), np.intp)
     palette = [np.zeros((1, vectors.shape[1]), np.float32)]
-    some = [np.flatnonzero(vectors[part].any(axis=1)) + part.start for part in blocks(len(vectors))]
+    some = [
+        np.flatnonzero(vectors[part].any(axis=1)) + part.start for part in row_slices(len(vectors))
+    ]
     rows = np.concatenate([np.zeros(0, np.intp), *some])
     rng = np.random.default_rng(0)
     sample = np.sort(rng.permutation(rows)[:_SAMPLE])
     coarse = _centres(vectors[sample], min(_COARSE, max(1, size // 8)), rng)
     cluster = np.empty(len(rows), np.int32)
-    for part in blocks(len(rows)):
+    for part in row_slices(len(rows)):
         cluster[part] = _assigned(vectors[rows[part]], coarse)
     # rows grouped by cluster, otherwise in their order
     rows = rows[np.argsort(cluster, kind="stable")]
     ends = np.cumsum(np.bincount(cluster, minlength=len(coarse)))
     used = 1
-    for k in blocks(len(coarse), 1):
+    for k in row_slices(len(coarse), 1):
         members = rows[ends[k.start - 1] if k.start else 0 : ends[k.start]]
         if not len(members):
             continue
@@ -113,7 +115,7 @@ def _distinct(vectors: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[n
     """(first row of each distinct vector, which one each row is), compared by a 64-bit hash."""
     factors = np.random.default_rng(1).integers(1, 1 << 63, vectors.shape[1], np.uint64) | 1
     sums = np.empty(len(vectors), np.uint64)
-    for rows in blocks(len(vectors)):
+    for rows in row_slices(len(vectors)):
         bits = np.ascontiguousarray(vectors[rows] + np.float32(0)).view(np.uint32)  # -0 is 0
         sums[rows] = (bits * factors).sum(axis=1)
     _, first, which = np.unique(sums, return_index=True, return_inverse=True)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.base.bad_files import BadFileError
-from stages.base.blocks import blocks
+from stages.base.row_slices import row_slices
 from stages.formats import smallest_three
 from stages.formats.ply_header import Header, binary_rows, header_text, read_header
 from stages.formats.values import (
@@ -61,7 +61,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
     """
     degree = int(splats.sh_degrees.max(initial=0))
     splats, rows = splats.with_sh_degree(degree), order(splats)
-    packed = [_pack(splats.take(rows[part])) for part in blocks(len(splats), _BLOCK)]
+    packed = [_pack(splats.take(rows[part])) for part in row_slices(len(splats), _BLOCK)]
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(_header_text(splats, degree, units))
         for part in range(3):  # all chunks, then all vertices, then all SH
@@ -95,7 +95,7 @@ def outlier_shells(means: NDArray[np.floating]) -> NDArray[np.int64]:
     limit = _OUTLIER_EXTENTS * float(np.linalg.norm(high - low))
     shells = np.zeros(len(means), np.int64)
     if limit > 0:
-        for part in blocks(len(means)):
+        for part in row_slices(len(means)):
             far = np.linalg.norm(means[part] - centre, axis=1) / limit
             shells[part] = np.ceil(np.log(np.maximum(far, 1)) / np.log(_SHELL_RATIO))
     return shells
@@ -214,7 +214,7 @@ def unpack(path: Path, header: Header) -> Splats:
     splats = allocate(len(vertices), degree)
     splats = replace(splats, origin=header.origin, place=header.place)
     splats = splats.with_antialias(header.antialias)
-    for rows in blocks(len(vertices), _BLOCK):
+    for rows in row_slices(len(vertices), _BLOCK):
         chunks = ranges[rows.start // CHUNK : -(-rows.stop // CHUNK)]
         _unpack_block(splats.take(rows), vertices[rows], chunks)
         if degree and rest is not None:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.blocks import blocks
+from stages.base.row_slices import row_slices
 from stages.formats.gltf_file import EXTENSION, Attribute, write_file
 from stages.formats.values import (
     linear_opacities,
@@ -60,7 +60,7 @@ def attributes(
     y_up = flipped(splats.with_sh_degree(0))
     opacities = linear_opacities(splats)
     colours = np.empty((len(splats), 4), colour_type)
-    for rows in blocks(len(splats)):
+    for rows in row_slices(len(splats)):
         linear = fallback_colours(splats.take(rows), opacities[rows])
         colours[rows] = np.rint(np.iinfo(colours.dtype).max * linear)
     values = {

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
-from stages.base.blocks import blocks
 from stages.base.distribution import VERSION
 from stages.base.errors import UsageError
+from stages.base.row_slices import row_slices
 from stages.formats.json_fields import location_fields
 from stages.scene import Splats
 from stages.scene.flip import flipped
@@ -223,6 +223,6 @@ def _size(attributes: Sequence[Attribute]) -> int:
 
 def _write_rows(file: BinaryIO, attributes: Sequence[Attribute]) -> None:
     for attribute in attributes:
-        for part in blocks(len(attribute.rows)):
+        for part in row_slices(len(attribute.rows)):
             rows = attribute.rows[part]
             file.write(np.ascontiguousarray(-rows if attribute.negated else rows).data)

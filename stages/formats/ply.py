@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.base.bad_files import BadFileError
-from stages.base.blocks import blocks, release_mapped_pages
+from stages.base.row_slices import release_mapped_pages, row_slices
 from stages.formats import compressed_ply
 from stages.formats.ply_header import Header, binary_rows, header_text, read_header
 from stages.formats.values import allocate
@@ -56,7 +56,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
 def file_blocks(splats: Splats, units: str) -> Iterator[bytes]:
     """The bytes of the file in blocks; every splat must be drawable."""
     yield _header_text(splats, units)
-    for rows in blocks(len(splats), _ROWS_AT_ONCE):
+    for rows in row_slices(len(splats), _ROWS_AT_ONCE):
         yield _table(splats, rows).tobytes()
 
 
@@ -153,7 +153,7 @@ def tables(file: BinaryIO, path: Path, header: Header) -> _Tables:
 
 def _binary_tables(mapped: NDArray[Any]) -> _Tables:
     """The rows of a binary file in blocks."""
-    for rows in blocks(len(mapped), _ROWS_AT_ONCE):
+    for rows in row_slices(len(mapped), _ROWS_AT_ONCE):
         block = np.array(mapped[rows])
         release_mapped_pages(mapped)
         yield rows, block
@@ -165,7 +165,7 @@ def _ascii_tables(file: BinaryIO, header: Header, skipped: int) -> _Tables:
     names = [name for name, _ in header.vertex.properties]
     file.seek(header.data_starts)
     np.fromfile(file, count=skipped, sep=" ")
-    for rows in blocks(header.vertex.count, _ROWS_AT_ONCE):
+    for rows in row_slices(header.vertex.count, _ROWS_AT_ONCE):
         wanted = (rows.stop - rows.start) * len(names)
         numbers = np.fromfile(file, count=wanted, sep=" ")
         if len(numbers) < wanted:

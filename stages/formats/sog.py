@@ -23,7 +23,7 @@ from PIL import Image
 
 from stages.base import scratch
 from stages.base.atomic import replacing
-from stages.base.blocks import blocks
+from stages.base.row_slices import row_slices
 from stages.formats import codebook, smallest_three
 from stages.formats.json_fields import location_fields
 from stages.formats.sog_read import ANTIALIASED, PALETTE_LIMIT, PER_LINE
@@ -113,7 +113,7 @@ def _positions(
     low, high = position_range(splats.means)
     span = np.where(high > low, high - low, 1.0)
     halves = np.empty((2, len(splats), 3), np.uint8)
-    for rows in blocks(len(splats)):
+    for rows in row_slices(len(splats)):
         steps = np.rint((symmetric_log(splats.means[places[rows]]) - low) / span * STEPS).astype(
             np.uint16
         )
@@ -143,7 +143,7 @@ def _shapes(
     book = codebook.scalar_codebook(np.clip(splats.log_scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT))
     meta["scales"] = {"codebook": _rounded(book), "files": ["scales.webp"]}
     scales, rotations = (np.empty((len(splats), n), np.uint8) for n in (3, 4))
-    for rows in blocks(len(splats)):
+    for rows in row_slices(len(splats)):
         part = splats.take(places[rows])
         scales[rows] = codebook.nearest(book, part.log_scales)
         largest, others = smallest_three.split(unit_quaternions(part.quaternions))
@@ -159,7 +159,7 @@ def _colours(
     book = codebook.scalar_codebook(np.clip(splats.sh[:, 0], -_DC_LIMIT, _DC_LIMIT))
     meta["sh0"] = {"codebook": _rounded(book), "files": ["sh0.webp"]}
     pixels = np.empty((len(splats), 4), np.uint8)
-    for rows in blocks(len(splats)):
+    for rows in row_slices(len(splats)):
         part = splats.take(places[rows])
         pixels[rows, :3] = codebook.nearest(book, part.sh[:, 0])
         pixels[rows, 3] = np.rint(255 * linear_opacities(part))
@@ -184,7 +184,7 @@ def _sh_palette(
 ) -> dict[str, NDArray[np.uint8]]:
     count = splats.sh.shape[1] - 1
     vectors = scratch.empty((len(splats), count, 3))
-    for rows in blocks(len(splats)):
+    for rows in row_slices(len(splats)):
         vectors[rows] = np.clip(splats.sh[places[rows], 1:], -_DC_LIMIT, _DC_LIMIT)
     palette, labels = palette_of(vectors)
     book = codebook.scalar_codebook(palette)

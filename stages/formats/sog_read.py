@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from stages.base.bad_files import BadFileError
-from stages.base.blocks import blocks
+from stages.base.row_slices import row_slices
 from stages.formats import smallest_three
 from stages.formats.json_fields import agreed, located, numbers, whole
 from stages.formats.values import allocate, logits_of
@@ -115,7 +115,7 @@ class Source:
         splats = allocate(count, math.isqrt(1 + palette.shape[1]) - 1)
         splats = located(splats, meta.get("asset"))
         splats = splats.with_antialias(antialias_of(meta))
-        for rows in blocks(count):
+        for rows in row_slices(count):
             out = splats.take(rows)
             steps = (low[rows] + 256.0 * high[rows]) / 65535
             encoded = ends[0] + (ends[1] - ends[0]) * steps

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.base.bad_files import BadFileError
-from stages.base.blocks import blocks
+from stages.base.row_slices import row_slices
 from stages.formats.values import (
     LOG_SCALE_MIN,
     allocate,
@@ -90,7 +90,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
     """
     splats, places = splats.with_sh_degree(0), order(splats)
     with replacing(path) as temporary, temporary.open("wb") as file:
-        for rows in blocks(len(splats)):
+        for rows in row_slices(len(splats)):
             file.write(encode(splats.take(places[rows])).tobytes())
 
 
@@ -101,6 +101,6 @@ def read(path: Path) -> Splats:
         raise BadFileError(f"its {size} bytes are no multiple of {RECORD.itemsize}")
     splats = allocate(size // RECORD.itemsize, 0)
     with path.open("rb") as file:
-        for rows in blocks(len(splats)):
+        for rows in row_slices(len(splats)):
             fill(splats.take(rows), decode(np.fromfile(file, RECORD, rows.stop - rows.start)))
     return splats

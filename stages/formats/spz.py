@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
-from stages.base.blocks import blocks
+from stages.base.row_slices import row_slices
 from stages.formats import smallest_three
 from stages.formats.spz_read import ANTIALIASED, COLOUR_SCALE, HEADER, MAGIC, MAGNITUDE
 from stages.formats.values import linear_opacities, unit_quaternions
@@ -66,7 +66,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
     ):
         packed.write(header)
         for array in arrays:
-            for rows in blocks(len(splats)):
+            for rows in row_slices(len(splats)):
                 packed.write(np.ascontiguousarray(array(splats.take(rows))).data)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError
-from stages.base.blocks import blocks
+from stages.base.row_slices import row_slices
 from stages.formats import smallest_three
 from stages.formats.inflate import check_size, read_rest, read_rows, read_zstd_frame
 from stages.formats.values import allocate, logits_of, unit_quaternions
@@ -148,7 +148,7 @@ def _decoded(head: Header, arrays: list[NDArray[np.uint8]]) -> Splats:
     """The splats in the axes of the file."""
     positions, opacities, colours, scales, rotations, sh = arrays
     splats = allocate(len(positions), head.degree)
-    for rows in blocks(len(positions)):
+    for rows in row_slices(len(positions)):
         out = splats.take(rows)
         padded = np.zeros((len(out), 3, 4), np.uint8)
         padded[:, :, 1:] = positions[rows].reshape(-1, 3, 3)

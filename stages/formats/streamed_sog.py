@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import make_folder, replacing, temporary_beside
 from stages.base.bad_files import BadFileError, reading
-from stages.base.blocks import blocks
 from stages.base.errors import UsageError
+from stages.base.row_slices import row_slices
 from stages.formats import html, sog
 from stages.formats.json_fields import agreed, located, location_fields, whole
 from stages.formats.sog_read import Source, antialias_of, in_folder, in_zip
@@ -211,7 +211,7 @@ def _write_chunks(
         used = [leaf for leaf in leaves if len(leaf.rows[level])]
         held: list[_Rows] = []
         first = len(names)
-        for index in blocks(len(used), 1):
+        for index in row_slices(len(used), 1):
             if not held:
                 names.append(f"{level}_{len(names) - first}/meta.json")
             leaf, before = used[index.start], sum(map(len, held))
@@ -244,7 +244,7 @@ def _described(part: _Tree, levels: Sequence[Splats]) -> dict[str, Any]:
 
 def _box(splats: Splats, rows: _Rows) -> tuple[list[float], list[float]]:
     lows, highs = [], []
-    for part in blocks(len(rows)):
+    for part in row_slices(len(rows)):
         some = rows[part]
         sizes = np.exp(splats.log_scales[some].astype(np.float64))
         reach = (np.abs(matrices_of(splats.quaternions[some])) * sizes[:, None, :]).sum(axis=2)

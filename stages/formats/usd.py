@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.atomic import partial_prefix, replacing
-from stages.base.blocks import blocks
+from stages.base.row_slices import row_slices
 from stages.formats.values import linear_opacities, linear_scales, unit_quaternions
 from stages.scene import Splats
 from stages.scene.flip import flipped
@@ -94,7 +94,7 @@ def _filled(kind: Any, splats: Splats, values_of: Callable[[Splats], NDArray[Any
     """A USD array of `values_of` the splats, y up. The library copies its arguments, so it gets
     one block at a time."""
     array, end = kind(0), 0
-    for rows in blocks(len(splats)):
+    for rows in row_slices(len(splats)):
         values = np.ascontiguousarray(values_of(flipped(splats.take(rows))), np.float32)
         if not end:
             array = kind(len(values) // (rows.stop - rows.start) * len(splats))
@@ -106,7 +106,7 @@ def _filled(kind: Any, splats: Splats, values_of: Callable[[Splats], NDArray[Any
 def _extent(splats: Splats) -> NDArray[np.float32]:
     """[2, 3] the bounding box of all ellipsoids of 3 standard deviations, y up."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for rows in blocks(len(splats)):
+    for rows in row_slices(len(splats)):
         block = flipped(splats.take(rows))
         reach = _reach(unit_quaternions(block.quaternions), linear_scales(block))
         low = np.minimum(low, (block.means - reach).min(axis=0))

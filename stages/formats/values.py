@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from stages.base import scratch
 from stages.base.bad_files import BadFileError
-from stages.base.blocks import blocks
 from stages.base.errors import SplatError
+from stages.base.row_slices import row_slices
 from stages.raster.definition import LOG_SCALE_MAX, QUATERNION_MIN
 from stages.scene import ROW_FIELDS, Splats
 
@@ -44,7 +44,7 @@ def drawable_rows(splats: Splats) -> NDArray[np.bool_]:
     """[N] whether a splat can be drawn: all values are finite, the squared scales fit float32 and
     the quaternion can be normalised. This is the rule of our rasteriser."""
     good = np.empty(len(splats), bool)
-    for rows in blocks(len(splats)):
+    for rows in row_slices(len(splats)):
         good[rows] = _drawable(splats.take(rows))
     return good
 
@@ -85,7 +85,7 @@ def select_rows(splats: Splats, keep: NDArray[np.bool_]) -> Splats:
         return splats
     arrays = empty_rows(splats, int(keep.sum()))
     start = 0
-    for rows in blocks(len(splats)):
+    for rows in row_slices(len(splats)):
         mask = keep[rows]
         there = slice(start, start + int(mask.sum()))
         for name, values in arrays.items():
@@ -105,7 +105,7 @@ def _by_blocks(
 ) -> NDArray[np.float32]:
     """`change` of the `values` in float64, as float32 of the same shape."""
     out = np.empty(values.shape, np.float32)
-    for rows in blocks(len(values)):
+    for rows in row_slices(len(values)):
         out[rows] = change(values[rows].astype(np.float64))
     return out
 
@@ -174,7 +174,7 @@ def fill(out: Splats, values: Splats) -> None:
 def sh_degrees_used(sh: NDArray[np.floating]) -> NDArray[np.uint8]:
     """[N] the highest degree with a nonzero coefficient in `sh` [N, (L + 1)^2, 3]."""
     degrees = np.zeros(len(sh), np.uint8)
-    for rows in blocks(len(sh)):
+    for rows in row_slices(len(sh)):
         for degree in range(1, round(sh.shape[1] ** 0.5)):
             coefficients = sh[rows, degree * degree : (degree + 1) ** 2]
             degrees[rows][(coefficients != 0).any(axis=(1, 2))] = degree
@@ -187,7 +187,7 @@ def check_finite(splats: Splats) -> Splats:
 
     Raises BadFileError if any other value is not finite: such a file is damaged.
     """
-    for rows in blocks(len(splats)):
+    for rows in row_slices(len(splats)):
         logits, logs = splats.opacity_logits[rows], splats.log_scales[rows]
         flat, opaque = np.isneginf(logs), np.isinf(logits)
         logs[flat] = LOG_SCALE_MIN
@@ -196,7 +196,7 @@ def check_finite(splats: Splats) -> Splats:
     clean = replace(splats, sh_degrees=sh_degrees_used(splats.sh))
     for name in (*ROW_FIELDS[:-1], "origin"):
         values = getattr(clean, name)
-        bad = sum(int((~np.isfinite(values[rows])).sum()) for rows in blocks(len(values)))
+        bad = sum(int((~np.isfinite(values[rows])).sum()) for rows in row_slices(len(values)))
         if bad and not allows_nonfinite():
             raise BadFileError(f"{bad} values of {name} are not finite numbers")
     return clean
@@ -212,7 +212,7 @@ def concatenate(parts: Sequence[Splats]) -> Splats:
     arrays = empty_rows(max(parts, key=lambda part: part.sh_degree), sum(map(len, parts)))
     start = 0
     for part in parts:
-        for rows in blocks(len(part)):
+        for rows in row_slices(len(part)):
             for name, every in arrays.items():
                 values = getattr(part, name)[rows]
                 out = every[start + rows.start : start + rows.stop]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base import scratch
-from stages.base.blocks import ROWS, blocks
+from stages.base.row_slices import ROWS, row_slices
 from stages.scene import Splats
 
 # From the axes of a file to ours. Not taken from the writers: their error must not check itself.
@@ -69,7 +69,7 @@ def arrays_by_rows(
 ) -> dict[str, NDArray[np.floating]]:
     """float32 arrays of `count` rows, of what `values_of` returns for slices of so many rows."""
     arrays: dict[str, NDArray[np.floating]] = {}
-    for part in blocks(count, rows) if count else [slice(0, 0)]:
+    for part in row_slices(count, rows) if count else [slice(0, 0)]:
         for name, values in values_of(part).items():
             if name not in arrays:
                 arrays[name] = scratch.empty((count, *values.shape[1:]))

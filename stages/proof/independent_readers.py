@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from plyfile import PlyData
 from pygltflib import GLTF2
 
-from stages.base.blocks import release_mapped_pages
+from stages.base.row_slices import release_mapped_pages
 from stages.base.usd_path import accepted_path
 from stages.formats.values import concatenate
 from stages.proof.content import (

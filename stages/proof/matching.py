@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base import scratch
-from stages.base.blocks import blocks
+from stages.base.row_slices import row_slices
 from stages.scene import Splats, dc_to_rgb
 from stages.scene.quantiles import quantiles
 
@@ -66,7 +66,7 @@ def matched_rows(truth: Splats, file: Splats, orders: Iterable[Rows]) -> Rows:
     found, fewest = (every, every, np.zeros(n, bool)), n + 1
     for index in (np.arange(n), *orders) if n else ():
         distance, unlike = np.empty(n, np.float32), np.empty(n, bool)
-        for rows in blocks(n):
+        for rows in row_slices(n):
             moved = np.abs(truth.means[index[rows]] - file.means[rows])
             distance[rows] = moved.max(axis=1, initial=0.0)
             unlike[rows] = _unlike(here.values[index[rows]], there.values[rows])
@@ -87,7 +87,7 @@ def matched_rows(truth: Splats, file: Splats, orders: Iterable[Rows]) -> Rows:
 def _values(splats: Splats) -> NDArray[np.float32]:
     """[N, 7] opacity, colour and log scales, each divided by its allowed difference."""
     values = scratch.empty((len(splats), 7))
-    for rows in blocks(len(splats)):
+    for rows in row_slices(len(splats)):
         block = splats.take(rows)
         values[rows, 0] = block.opacities / _OPACITY
         values[rows, 1:4] = np.minimum(dc_to_rgb(block.sh[:, 0]), 1) / _COLOUR

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.blocks import blocks
 from stages.base.errors import QualityError
+from stages.base.row_slices import row_slices
 from stages.base.text import reason_of
 from stages.evaluate.image_metrics import IDENTICAL_DB, capped_psnr_db
 from stages.formats import BY_ENDING, format_of
@@ -227,7 +227,7 @@ def _central_rows(splats: Splats) -> NDArray[np.bool_] | slice:
         return slice(None)
     middle = [np.median(splats.means[:, axis]) for axis in range(3)]
     far = np.empty(len(splats), np.float32)
-    for rows in blocks(len(splats)):
+    for rows in row_slices(len(splats)):
         far[rows] = np.linalg.norm(splats.means[rows] - middle, axis=1)
     drawn = np.zeros(len(splats), bool)
     drawn[np.argpartition(far, _MAX_DRAWN)[:_MAX_DRAWN]] = True

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.blocks import blocks
+from stages.base.row_slices import row_slices
 from stages.raster.definition import ALPHA_MIN, LOG_SCALE_MAX, QUATERNION_MIN
 from stages.scene import ROW_FIELDS, Splats
 from stages.scene.quantiles import quantiles
@@ -68,7 +68,7 @@ def statistics_of(splats: Splats) -> Statistics:
     whole, not_finite = _finite(splats)
     box = dict(zip(_BOX, quantiles(splats.means[whole], tuple(_BOX.values())), strict=True))
     troubles: Counter[str] = Counter()
-    for rows in blocks(len(splats)):
+    for rows in row_slices(len(splats)):
         for name, marks in _troubles(splats.take(rows).take(whole[rows]), box).items():
             troubles[name] += int(np.count_nonzero(marks))
     return Statistics(
@@ -87,7 +87,7 @@ def _finite(splats: Splats) -> tuple[NDArray[np.bool_], dict[str, int]]:
     """([N] whether every value is finite; by attribute, how many splats fail)."""
     whole = np.ones(len(splats), bool)
     failed = dict.fromkeys(_VALUES, 0)
-    for rows in blocks(len(splats)):
+    for rows in row_slices(len(splats)):
         for name in _VALUES:
             values = getattr(splats, name)[rows]
             good = np.isfinite(values).all(axis=tuple(range(1, values.ndim)))

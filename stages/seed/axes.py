@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from stages.base.blocks import blocks
+from stages.base.row_slices import row_slices
 from stages.scene import Camera
 from stages.scene.rotations import quaternions_of
 
@@ -32,7 +32,7 @@ def surface_rotations(
     up = _up(cameras)
     count = min(NEIGHBOURS + 1, len(points))
     tree, found = cKDTree(points), np.empty((len(points), 4))
-    for rows in blocks(len(points)):
+    for rows in row_slices(len(points)):
         near = points[np.reshape(tree.query(points[rows], count)[1], (-1, count))]
         spread = near - near.mean(axis=1, keepdims=True)
         principal = np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread))[1]  # smallest first

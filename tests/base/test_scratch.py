@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from stages.base import scratch
-from stages.base.blocks import blocks
 from stages.base.errors import SplatError
+from stages.base.row_slices import row_slices
 
 
 @pytest.fixture(autouse=True)
@@ -34,7 +34,7 @@ def test_large_arrays_are_mapped_where_a_place_is_named_and_small_ones_never(
 def test_values_stay_when_their_pages_are_let_go(tmp_path: Path) -> None:
     with scratch.scratch_in(tmp_path):
         found = scratch.empty((5000,))
-    for rows in blocks(5000, 100):
+    for rows in row_slices(5000, 100):
         found[rows] = np.arange(rows.start, rows.stop)
     assert (found == np.arange(5000)).all()
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from stages.base.blocks import blocks
+from stages.base.row_slices import row_slices
 
 CANDIDATES = 48  # for each photograph
 NEIGHBOURS = 4  # in the capture's order, on either side
@@ -59,7 +59,7 @@ def _cosines(
     scaled = (sparse.diags(1.0 / np.maximum(lengths, 1e-12)) @ table).tocsr()
     others = scaled.T.tocsr()
     cosines = np.empty((photographs, photographs))
-    for part in blocks(photographs, _BLOCK):
+    for part in row_slices(photographs, _BLOCK):
         cosines[part] = np.round((scaled[part] @ others).toarray(), 9)
         tick(part.stop)
     return cosines

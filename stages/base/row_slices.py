@@ -1,4 +1,4 @@
-"""Work on many rows a block at a time, so that temporary arrays stay small."""
+"""Work on many rows a slice at a time, so that temporary arrays stay small."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from stages.base.scratch import release_scratch_pages
 ROWS = 1 << 16  # 16 MB of splats of degree 3
 
 
-def blocks(count: int, rows: int = ROWS) -> Iterator[slice]:
+def row_slices(count: int, rows: int = ROWS) -> Iterator[slice]:
     """Slices of at most `rows` that cover 0..count. Pages of scratch arrays are released after
     each."""
     for start in range(0, count, rows):
