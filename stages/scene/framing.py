@@ -11,11 +11,58 @@ from stages.scene.splats import Splats
 
 _WIDTH_PX = 960
 _MEANS_FOR_DEPTH = 4000
+_SAMPLE = 100_000  # splats that choose where to look from
+_LARGEST = 300.0  # logarithm of an area, so that it stays finite
+_SIDES = 16  # directions that are tried
+_HEIGHT = 0.3  # of the camera above the centre, as part of its level distance
+_DISTANCE = 2.2  # in radii of the densest part
+_CONE = 0.35  # half width of what must be free, as part of the distance
+_FREE = 0.05  # part of that width's area that a side must be freer by
+_LENS = 0.8  # focal length in widths
 
 
 def front_camera(splats: Splats) -> Camera:
-    """A camera that sees the middle nine tenths of the splats, from -z and a little above."""
-    return orbit_cameras(splats, 1, 0.9)[0]
+    """A camera a little above the densest part of the splats, near enough to be inside a room
+    around it, on the side where least lies between; in front (-z) if several sides are free."""
+    means, sizes = _sampled(splats)
+    centre, radius = _densest_part(means)
+    distance = _DISTANCE * radius
+    best, direction = np.inf, np.zeros(3)
+    for angle in 2 * np.pi * np.arange(_SIDES) / _SIDES:
+        tried = np.array([np.sin(angle), -_HEIGHT, -np.cos(angle)]) / np.hypot(1, _HEIGHT)
+        along = (means - centre) @ tried
+        aside = np.linalg.norm(means - centre - along[:, None] * tried, axis=1)
+        between = (along > radius) & (along < 1.2 * distance) & (aside < _CONE * along)
+        covered = float(sizes[between].sum()) / (_CONE * distance) ** 2
+        if covered < best - _FREE:
+            best, direction = covered, tried
+    eye = centre + distance * direction
+    width, height = _WIDTH_PX, _WIDTH_PX * 3 // 4
+    lens = (_LENS * width, _LENS * width, width / 2, height / 2)
+    return Camera(width, height, *lens, look_at(eye, centre))
+
+
+def _sampled(splats: Splats) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(means [M, 3], area times opacity [M]) of at most _SAMPLE splats that can be drawn."""
+    step = max(1, len(splats) // _SAMPLE)
+    means = splats.means[::step].astype(np.float64)
+    scales = splats.log_scales[::step].max(axis=1, initial=-np.inf).astype(np.float64)
+    areas = np.exp(np.minimum(2 * scales, _LARGEST)) * splats.opacities[::step]
+    drawable = np.isfinite(means).all(axis=1) & np.isfinite(areas)
+    return means[drawable], areas[drawable]
+
+
+def _densest_part(means: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """(centre [3], radius) of a ball that holds a third of the means: the median of those nearest
+    to the median, of fewer and fewer."""
+    if not len(means):
+        return np.zeros(3), 1e-3
+    centre = np.median(means, axis=0)
+    for share in (0.8, 0.6, 0.45, 1 / 3):
+        away = np.linalg.norm(means - centre, axis=1)
+        centre = np.median(means[away <= np.quantile(away, share)], axis=0)
+    away = np.linalg.norm(means - centre, axis=1)
+    return centre, max(float(np.quantile(away, 1 / 3)), 1e-3)
 
 
 def orbit_cameras(splats: Splats, count: int, part: float) -> tuple[Camera, ...]:

@@ -141,6 +141,8 @@ def test_keys_step_through_the_cameras(browser: Browser, page: Path) -> None:
     assert "Moved" in browser.run(note)
     press(browser, "b", 66)
     assert browser.run(note) == ""
+    press(browser, "f", 70)
+    assert browser.run(shown) == 0  # not back to where all is seen, outside of a room
 
 
 def test_a_page_for_a_client_has_its_title_background_and_full_screen_and_no_panel(

@@ -66,6 +66,20 @@ function loaded(viewer) {
     });
 }
 
+// "Frame", by key or button: the first camera. The viewer's own goes back until it sees all splats,
+// which is outside the room.
+function frameBy(act) {
+    const instead = (event) => {
+        event.stopPropagation();
+        act();
+    };
+    document.addEventListener("keydown", (event) => {
+        const plain = !event.ctrlKey && !event.metaKey && !event.altKey;
+        if (plain && event.key.toLowerCase() === "f" && !takesKey(event.target, "f")) instead(event);
+    });
+    for (const button of document.querySelectorAll(".sse-frame")) button.addEventListener("click", instead, true);
+}
+
 async function checkGraphics() {
     const canvas = document.createElement("canvas");
     if (canvas.getContext("webgl2")) return;
@@ -126,6 +140,7 @@ async function start() {
     find("message").hidden = true;
     const heldOut = scene.shots.find((shot) => shot.held_out);
     const first = named(query.get("camera")) || heldOut || scene.shots[0];
+    frameBy(() => show(first));
     return window.splatShow(first.name);
 }
 
