@@ -12,6 +12,7 @@ from scipy.special import ndtri, stdtrit
 
 RESAMPLES = 10_000
 CONFIDENCE = 0.95
+FEWEST_SHOWN = 5  # views: the interval of fewer says little, and is not shown
 _SEED = 0  # equal differences get equal intervals
 BETTER, WORSE, INCONCLUSIVE = "better", "worse", "no significant difference"
 
@@ -30,6 +31,11 @@ class Difference:
     low: float
     high: float
     views: int
+
+    @property
+    def shown(self) -> bool:
+        """Whether the interval is of enough views to be shown."""
+        return self.views >= FEWEST_SHOWN
 
     @property
     def verdict(self) -> str:

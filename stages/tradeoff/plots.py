@@ -79,7 +79,7 @@ def _curve(axes: Axes, tradeoff: Tradeoff, costs: list[float]) -> None:
     axes.plot(costs, [p.psnr_db for p in points], "-", color=BLUE, linewidth=1)
     for x, point in zip(costs[1:], points[1:], strict=True):
         low, high = point.change.mean - point.change.low, point.change.high - point.change.mean
-        bars = [[low], [high]] if max(low, high) < float("inf") else None
+        bars = [[low], [high]] if point.change.shown else None
         axes.errorbar(
             [x], [point.psnr_db], yerr=bars, fmt="o", color=BLUE, ms=5, elinewidth=1, capsize=3
         )
@@ -87,7 +87,8 @@ def _curve(axes: Axes, tradeoff: Tradeoff, costs: list[float]) -> None:
     if at:
         knee_at = [costs[at]], [points[at].psnr_db]
         axes.plot(*knee_at, "o", ms=13, mfc="none", color=ORANGE, label="knee")
-    axes.errorbar([], [], yerr=[], fmt="o", color=BLUE, label="95 % interval of the change")
+    if points[-1].change.shown:
+        axes.errorbar([], [], yerr=[], fmt="o", color=BLUE, label="95 % interval of the change")
     axes.legend()
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from stages.base.text import counted
 from stages.evaluate.coverage import MIN_ANGLE_DEG, MIN_VIEWS, CameraLayout, Gap, PoorRegion
-from stages.tradeoff.bootstrap import Difference
+from stages.tradeoff.bootstrap import FEWEST_SHOWN, Difference
 from stages.tradeoff.curves import Coverage, OperatingPoint, Tradeoff, time_to
 
 SMALL_LOSS_DB = 0.1  # that few people would see
@@ -112,7 +112,9 @@ def about_photographs(tradeoff: Tradeoff) -> list[str]:
         f"The worst of {count} is no. {tradeoff.scores.index(worst) + 1}, {worst.name}: "
         f"{worst.psnr_db:.2f} dB, {tradeoff.own.psnr_db - worst.psnr_db:.2f} below the mean."
     ]
-    if count < 8:
+    if count < FEWEST_SHOWN:
+        lines.append(f"{counted(count, 'held-out view')} are too few for intervals.")
+    elif count < 8:
         lines.append(f"There are only {counted(count, 'held-out view')}: intervals are wide.")
     return lines
 
@@ -210,7 +212,9 @@ def costs(change: Difference) -> str:
     """ "costs 0.21 dB (95 %: 0.10 to 0.32)"."""
     sign = -1 if change.mean <= 0 else 1
     ends = sorted((sign * change.low, sign * change.high))
-    interval = f"95 %: {ends[0]:.2f} to {ends[1]:.2f}" if math.isfinite(ends[1]) else "one view"
+    interval = f"95 %: {ends[0]:.2f} to {ends[1]:.2f}"
+    if not change.shown:
+        interval = f"of {counted(change.views, 'photograph')}"
     return f"{'costs' if sign < 0 else 'gains'} {abs(change.mean):.2f} dB ({interval})"
 
 

@@ -58,8 +58,12 @@ def test_a_loss_is_a_cost_and_its_interval_has_the_same_sign():
 
 
 def test_a_single_view_has_no_interval():
-    assert report_text.costs(paired_difference(np.array([-0.2]))) == "costs 0.20 dB (one view)"
-    assert report_text.costs(paired_difference(np.array([0.2]))) == "gains 0.20 dB (one view)"
+    assert (
+        report_text.costs(paired_difference(np.array([-0.2]))) == "costs 0.20 dB (of 1 photograph)"
+    )
+    assert (
+        report_text.costs(paired_difference(np.array([0.2]))) == "gains 0.20 dB (of 1 photograph)"
+    )
 
 
 def empty_coverage() -> Coverage:
@@ -75,3 +79,10 @@ def test_a_run_without_a_log_says_so(logged):
     course = tuple(history(20.0)[:logged])
     tradeoff = Tradeoff(own, course, (), (own,), (), 480, empty_coverage())
     assert report_text.about_time(tradeoff) == [report_text.NO_TIMES]
+
+
+def test_an_interval_of_few_photographs_is_not_shown() -> None:
+    few = paired_difference(np.array([-0.2, -0.3, -0.1]))
+    assert report_text.costs(few) == "costs 0.20 dB (of 3 photographs)"
+    enough = paired_difference(np.array([-0.2, -0.3, -0.1, -0.2, -0.2]))
+    assert "95 %" in report_text.costs(enough)
