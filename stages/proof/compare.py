@@ -16,7 +16,7 @@ from stages.scene import SH_C0, Splats
 from stages.scene.flip import FLIP, flipped
 from stages.scene.quantiles import median_spacing
 
-_BLOCK = 1 << 16  # rows compared at a time: copies stay small however large the file is
+_BLOCK = 1 << 14  # rows compared at a time: copies stay small however large the file is
 
 # Errors that begin to be visible, to compare attributes: share of the scene's extent, natural
 # logarithm, degrees, and one step of 8 bits.
