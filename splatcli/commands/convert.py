@@ -23,6 +23,7 @@ from stages.run import results
 from stages.scene import Splats
 
 _STEPS = 3
+_UNSEEN_DB = 40.0  # PSNR above which pictures of 8 bits look alike, an error of 1 % of the range
 
 
 def convert(
@@ -91,7 +92,9 @@ def _refuse_nothing(source: Path, target: Path, splats: Splats, dropped: int) ->
 def _show(facts: dict[str, Any], found: dict[str, Any]) -> None:
     size = f"{facts['splats']:,} splats, {console.size(facts['size_bytes'])}"
     quality = console.fidelity(found["verify_db"])
-    console.note(f"{facts['target']}: {size}, {facts['bytes_per_splat']:.1f} bytes each, {quality}")
+    seen = ", no difference is seen" if console.EXACT_DB > found["verify_db"] >= _UNSEEN_DB else ""
+    each = f"{facts['bytes_per_splat']:.1f} bytes each"
+    console.note(f"{facts['target']}: {size}, {each}, {quality}{seen}")
     worst = {name: found[name] for name in found if name.startswith("max_") and found[name] > 0}
     if worst and not console.mode.quiet:
         console.note(f"Largest differences: {console.figures(worst)}", "dim")

@@ -8,6 +8,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 
 from splatcli import console
@@ -23,6 +24,9 @@ from stages.proof.prover import Proof, Prover, cameras_for, provers_of
 from stages.run import results, runfolder
 from stages.run.pipeline import Pipeline
 from stages.scene import QuantisedSplats, View
+
+
+_ELSEWHERE = 1e-6  # units between two origins
 
 
 @dataclass(frozen=True)
@@ -65,16 +69,22 @@ def verify(
     for number, file in enumerate(files):
         console.step(f"verifying {file}", done=number, total=len(files))
         # Our own reader first: it reports damage that makes other parsers crash.
-        formats.read(file)
+        origin = formats.read(file).origin
         original = original or _original(file, against)
         for prover in original.provers_of(file):
             proof = prover.prove(file)
             if not proof.fault:
                 break
         found.append((file, proof))
-        losses += [] if proof.fault else changes_shown(file, prover.splats, proof).values()
+        shown = [] if proof.fault else [*changes_shown(file, prover.splats, proof).values()]
+        if (apart := float(np.linalg.norm(origin - prover.splats.origin))) > _ELSEWHERE:
+            shown.append(
+                f"{file.name} lies {apart:.4g} units from {original.name}, by the origins that both "
+                "declare; their positions were compared relative to these."
+            )
+        losses += shown
         if console.mode.as_json:
-            console.emit("verified", **_facts(file, proof, original))
+            console.emit("verified", **_facts(file, proof, original), warnings=shown)
     assert original is not None
     if not console.mode.as_json:
         _print(found, original, losses)

@@ -164,6 +164,14 @@ def test_an_origin_that_a_file_cannot_hold_is_reported(tmp_path: Path, ending: s
     assert (tmp_path / f"b.{ending}.offset.json").is_file()
 
 
+def test_it_is_said_whether_a_difference_is_seen(tmp_path: Path) -> None:
+    splats = replace(many_splats(300), origin=np.zeros(3))
+    formats.write(tmp_path / "a.ply", splats)
+    assert "no difference is seen" in converted(tmp_path / "a.ply", tmp_path / "b.quantised.glb")[1]
+    for name in ("b.ply", "b.splat"):
+        assert "difference is seen" not in converted(tmp_path / "a.ply", tmp_path / name)[1]
+
+
 def test_a_loss_below_30_db_is_reported_with_its_cause(tmp_path: Path) -> None:
     splats = replace(many_splats(200), origin=np.zeros(3))
     splats.sh[:, 1:] = np.random.default_rng(0).normal(0, 1.5, splats.sh[:, 1:].shape)

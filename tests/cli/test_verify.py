@@ -136,6 +136,17 @@ def test_a_file_far_from_zero_is_right(tmp_path: Path, name: str, written: str) 
     verified(path, "--against", path)
 
 
+def test_a_file_that_lies_elsewhere_is_told(tmp_path: Path) -> None:
+    splats = replace(many_splats(50), origin=np.array([5e5, 0.0, 0.0]))
+    formats.write(tmp_path / "a.ply", splats)
+    formats.write(tmp_path / "b.spz", splats)
+    *_, found = events(tmp_path / "b.spz", "--against", tmp_path / "a.ply")
+    assert found["warnings"] == []
+    (tmp_path / "b.spz.offset.json").unlink()
+    *_, found = events(tmp_path / "b.spz", "--against", tmp_path / "a.ply")
+    assert "b.spz lies 5e+05 units from" in found["warnings"][0]
+
+
 def test_verifying_changes_nothing_in_the_run(run: Path) -> None:
     before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
     verified(run)
