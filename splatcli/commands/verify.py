@@ -25,7 +25,6 @@ from stages.run import results, runfolder
 from stages.run.pipeline import Pipeline
 from stages.scene import QuantisedSplats, View
 
-
 _ELSEWHERE = 1e-6  # units between two origins
 
 
@@ -79,8 +78,8 @@ def verify(
         shown = [] if proof.fault else [*changes_shown(file, prover.splats, proof).values()]
         if (apart := float(np.linalg.norm(origin - prover.splats.origin))) > _ELSEWHERE:
             shown.append(
-                f"{file.name} lies {apart:.4g} units from {original.name}, by the origins that both "
-                "declare; their positions were compared relative to these."
+                f"{file.name} lies {apart:.4g} units from {original.name}, by the origins that "
+                "both declare; their positions were compared relative to these."
             )
         losses += shown
         if console.mode.as_json:
