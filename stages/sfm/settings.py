@@ -99,7 +99,7 @@ class SfmSettings:
 
 STAGE = Stage(
     "sfm",
-    version=23,
+    version=24,
     reads=("ingest",),
     settings_type=SfmSettings,
     **in_module("stages.sfm.stage"),
