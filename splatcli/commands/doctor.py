@@ -28,6 +28,9 @@ from stages.raster.kernels import cache
 _LITTLE_MEMORY_MIB = 2048.0
 _LITTLE_DISK_BYTES = 2_000_000_000
 _BACKEND_ADVICE = "docs/guide/gpu.md says what it takes."
+# CPU minutes of a whole run of the sample, 24 photographs of 640 px, with AVX-512; see README.
+_CPU_MINUTES = {"preview": 3.0, "standard": 14.0}
+_WITHOUT_AVX512 = 2.0
 _VIDEO_CODECS = ("h264", "hevc", "av1", "vp9", "vp8", "mpeg4", "prores", "mjpeg", "gif")
 
 
@@ -71,6 +74,7 @@ def checks() -> Iterator[Check]:
     for backend in BACKENDS:
         yield _backend(backend)
     yield Check("--backend auto", backend_of(AUTO).name)
+    yield _attempted("so training", _meaning, needed=False)
 
 
 def _library(distribution: str) -> Check:
@@ -121,6 +125,24 @@ def _gpu() -> str:
     """The GPU, also if torch cannot use it."""
     missing = device.missing()
     return f"{missing}; {device.built()}" if missing else device.describe()
+
+
+def _meaning() -> str:
+    """Where training happens, and how long it takes there."""
+    if backend_of(AUTO).name != "cpu":
+        return f"uses {backend_of(AUTO).name} ({device.describe()})"
+    slower = 1.0 if _has_avx512() else _WITHOUT_AVX512
+    takes = (
+        f"about {max(1, round(slower * minutes / threads.count()))} min at `{preset}`"
+        for preset, minutes in _CPU_MINUTES.items()
+    )
+    return f"uses the CPU, no GPU: 24 photographs of 640 px take {', '.join(takes)}, a whole run"
+
+
+def _has_avx512() -> bool:
+    from llvmlite import binding  # with Numba, which may be missing
+
+    return bool(binding.get_host_cpu_features().get("avx512f"))
 
 
 def _photograph_formats() -> str:

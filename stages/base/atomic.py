@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import csv
 import errno
+import gc
 import os
 import platform
 import re
 import shutil
 import tempfile
+import time
 import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -21,6 +23,8 @@ from stages.base.errors import ResourceError, SplatError
 
 _PARTIAL = ".partial-"
 _NAME_BYTES = 255
+_WINDOWS = os.name == "nt"
+_WAITS_S = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
 
 
 def partial_prefix() -> str:
@@ -43,6 +47,23 @@ def remove_abandoned_files(folder: Path) -> None:
                 path.unlink() if not path.is_dir() else shutil.rmtree(path, ignore_errors=True)
 
 
+def rename(source: Path, target: Path) -> None:
+    """Rename a file or a folder, and replace a file of that name. Raises OSError.
+
+    Windows refuses while a file is open or mapped, here or by a scanner of viruses: maps that
+    nothing refers to are closed, and it is tried again for three seconds.
+    """
+    for wait_s in (*_WAITS_S, None):
+        try:
+            os.replace(source, target)
+            return
+        except PermissionError:
+            if not _WINDOWS or wait_s is None:
+                raise
+            gc.collect()
+            time.sleep(wait_s)
+
+
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary name beside `path`; its file replaces `path` when the block ends.
@@ -59,7 +80,7 @@ def replacing(path: Path) -> Iterator[Path]:
         yield temporary
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
-        os.replace(temporary, path)
+        rename(temporary, path)
         sync_folder(path.parent)
     except OSError as error:
         raise _refused(path, error) from error

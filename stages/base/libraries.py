@@ -15,7 +15,8 @@ _PYPROJECT = Path(__file__).resolve().parents[2] / "pyproject.toml"
 
 
 def needed() -> tuple[str, ...]:
-    """Names of the distributions that the project depends on, without its extras.
+    """Names of the distributions that the project depends on, without its extras; of one that only
+    some versions of Python or systems get, where it is installed.
 
     They come from the installed metadata, or from `pyproject.toml` in a checkout that was never
     installed; () if there is neither.
@@ -26,8 +27,10 @@ def needed() -> tuple[str, ...]:
         if not _PYPROJECT.is_file():
             return ()
         lines = tomllib.loads(_PYPROJECT.read_text(encoding="utf-8"))["project"]["dependencies"]
-    always = (line for line in lines if not re.search(r"\bextra\s*==", line))
-    return tuple(re.split(r"[^\w.-]", line, maxsplit=1)[0] for line in always)
+    always = [line for line in lines if not re.search(r"\bextra\s*==", line)]
+    names = [re.split(r"[^\w.-]", line, maxsplit=1)[0] for line in always]
+    both = zip(names, always, strict=True)
+    return tuple(name for name, line in both if ";" not in line or modules_of(name))
 
 
 def modules_of(name: str) -> tuple[str, ...]:

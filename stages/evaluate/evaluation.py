@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.errors import Interrupted
-from stages.evaluate.image_metrics import capped_psnr_db, flip, ssim
+from stages.evaluate.image_metrics import capped_psnr_db, flip, has_flip, ssim
 from stages.raster.draw import renderer
 from stages.scene import IGNORE, TRANSPARENT, Camera, DrawSettings, Splats, View
 from stages.scene.light import BRIGHT, OFFSET, Light, gains_and_offsets, vignetting_gains
@@ -224,7 +224,7 @@ def evaluate_at_sizes(
         The scores of the views by the name of the size.
     """
     scores: dict[str, list[Score]] = {name: [] for name in sizes}
-    with_flip_too = evaluation_subset(len(views)) if with_flip else ()
+    with_flip_too = evaluation_subset(len(views)) if with_flip and has_flip() else ()
     for number, full in enumerate(views):
         for name, scale in sizes.items():
             view = full.scaled(scale)

@@ -7,6 +7,7 @@ count; None for all.
 from __future__ import annotations
 
 import math
+from importlib.util import find_spec
 
 import cv2
 import numpy as np
@@ -58,6 +59,11 @@ def ssim(image: NDArray[np.floating], truth: NDArray[np.floating], valid: Valid 
     score = (2 * mean_a * mean_b + c1) * (2 * cov + c2)
     score /= (mean_a * mean_a + mean_b * mean_b + c1) * (var_a + var_b + c2)
     return _mean(score, valid)
+
+
+def has_flip() -> bool:
+    """Whether the evaluator of FLIP is installed: it has no wheels for Python 3.14."""
+    return find_spec("flip_evaluator") is not None
 
 
 def flip(image: NDArray[np.floating], truth: NDArray[np.floating], valid: Valid = None) -> float:

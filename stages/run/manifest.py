@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from stages.base.atomic import sync_folder
+from stages.base.atomic import rename, sync_folder
 from stages.base.disk import not_permitted
 from stages.base.errors import RunFolderError, SplatError
 from stages.run.digests import FileRecords, records_from_data
@@ -113,7 +113,7 @@ def write_json(path: Path, data: Mapping[str, Any]) -> None:
         file.write("\n")
         file.flush()
         os.fsync(file.fileno())
-    temporary.replace(path)
+    rename(temporary, path)
     sync_folder(path.parent)
 
 

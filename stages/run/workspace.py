@@ -16,7 +16,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from stages.base.atomic import sync_folder
+from stages.base.atomic import rename, sync_folder
 from stages.base.errors import SplatError
 from stages.base.stage import Stage
 from stages.run.digests import damage
@@ -92,7 +92,7 @@ class Workspace:
         if (self.partial / MANIFEST).exists():
             self._replace()
         elif self.old.exists() and not self.final.exists():
-            self.old.rename(self.final)
+            rename(self.old, self.final)
             sync_folder(self.run_folder)
         self._drop_old()
 
@@ -120,8 +120,8 @@ class Workspace:
             (self.partial / name).unlink(missing_ok=True)
         if self.final.exists():
             self._drop_old()
-            self.final.rename(self.old)
-        self.partial.rename(self.final)
+            rename(self.final, self.old)
+        rename(self.partial, self.final)
         sync_folder(self.run_folder)  # before the old output goes
         self._drop_old()
 
@@ -130,11 +130,11 @@ class Workspace:
         if self.old.exists():
             for name, kept in self.files_of_others(self.old, self.final).items():
                 (self.final / kept).parent.mkdir(parents=True, exist_ok=True)
-                (self.old / name).rename(self.final / kept)
+                rename(self.old / name, self.final / kept)
                 sync_folder((self.final / kept).parent)
             if self._dropped.exists():
                 shutil.rmtree(self._dropped)
-            self.old.rename(self._dropped)  # half deleted, it would not tell what is whose
+            rename(self.old, self._dropped)  # half deleted, it would not tell what is whose
             sync_folder(self.run_folder)
         shutil.rmtree(self._dropped, ignore_errors=True)
 

@@ -20,7 +20,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.lib import format as npy
 
-from stages.base.atomic import sync_folder
+from stages.base.atomic import rename, sync_folder
 from stages.raster.backends import backend_of
 from stages.train.clock import Elapsed
 from stages.train.history import HistoryEntry
@@ -89,8 +89,8 @@ def save_checkpoint(folder: Path, model: Model, state: TrainingState) -> None:
         file.flush()
         os.fsync(file.fileno())
     if path.exists():
-        os.replace(path, folder / _PREVIOUS)
-    os.replace(temporary, path)
+        rename(path, folder / _PREVIOUS)
+    rename(temporary, path)
     sync_folder(folder)
 
 
@@ -110,7 +110,7 @@ def load_checkpoint(
                 return _read(file)
         aside = path.with_stem(f"{path.stem}-damaged")
         with suppress(OSError):
-            os.replace(path, aside)
+            rename(path, aside)
         warn(
             "train-checkpoint-damaged",
             f"A checkpoint is damaged: its checksum does not fit. It was renamed to {aside.name}; "

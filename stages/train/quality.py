@@ -99,4 +99,5 @@ def _report_scores(by_size: Mapping[str, Sequence[Score]], report: Report) -> No
     report.metric("psnr_worst_view", worst.name)
     report.metric("psnr_spread_db", round(float(np.std(values)), 3))
     report.metric("ssim", round(float(np.mean([score.ssim for score in scores])), 4))
-    report.metric("flip", round(float(np.mean(flips)), 4))
+    if flips:
+        report.metric("flip", round(float(np.mean(flips)), 4))

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import errno
+import mmap
 import os
 import subprocess
 import sys
+import weakref
 from pathlib import Path
 
 import pytest
 
+from stages.base import atomic
 from stages.base.atomic import partial_prefix, remove_abandoned_files, replacing
 
 
@@ -18,6 +21,38 @@ def ended() -> str:
     code = "from stages.base.atomic import partial_prefix; print(partial_prefix())"
     command = [sys.executable, "-c", code]
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def test_on_windows_a_rename_that_is_refused_is_tried_again_and_maps_are_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refused, real = [], os.replace
+
+    def replace(source: Path, target: Path) -> None:
+        if len(refused) < 2:
+            refused.append(source)
+            raise PermissionError(13, "used by another process")
+        real(source, target)
+
+    monkeypatch.setattr(os, "replace", replace)
+    monkeypatch.setattr(atomic, "_WAITS_S", (0.0, 0.0))
+    (tmp_path / "a").write_text("new")
+    with pytest.raises(PermissionError):
+        atomic.rename(tmp_path / "a", tmp_path / "b")
+    monkeypatch.setattr(atomic, "_WINDOWS", True)
+    refused.clear()
+    cycle: list[object] = [mmap.mmap(-1, 10)]
+    cycle.append(cycle)
+    held = weakref.ref(cycle[0])
+    del cycle
+    atomic.rename(tmp_path / "a", tmp_path / "b")
+    assert (tmp_path / "b").read_text() == "new"
+    assert held() is None
+    refused[:] = []
+    (tmp_path / "a").write_text("newer")
+    monkeypatch.setattr(atomic, "_WAITS_S", (0.0,))
+    with pytest.raises(PermissionError):
+        atomic.rename(tmp_path / "a", tmp_path / "b")
 
 
 def test_what_a_killed_process_left_goes_and_what_lives_stays(tmp_path: Path) -> None:

@@ -51,6 +51,8 @@ def test_a_checkout_that_is_not_installed_knows_its_dependencies(
 def test_dependencies_are_read_less_extras_and_versions(monkeypatch: pytest.MonkeyPatch) -> None:
     lines = ["a.b-c<2,>=1", "usd-core (>=25)", 'x ; python_version < "3"', 'pytest ; extra == "t"']
     monkeypatch.setattr(libraries, "requires", lambda name: lines)
+    assert libraries.needed() == ("a.b-c", "usd-core")  # x is for other versions of Python
+    monkeypatch.setattr(libraries, "modules_of", lambda name: ("x",))
     assert libraries.needed() == ("a.b-c", "usd-core", "x")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from typer.testing import CliRunner
@@ -39,6 +40,21 @@ def test_a_library_that_is_missing_or_broken_is_named(monkeypatch: pytest.Monkey
     assert not found["no-such-distribution"]["ok"]
     assert "wave_of_none" in found["plyfile"]["value"]
     assert CliRunner().invoke(app, ["doctor"]).exit_code == 6
+
+
+@pytest.mark.parametrize(("avx512", "minutes"), [(True, (2, 7)), (False, (3, 14))])
+def test_it_ends_with_what_it_means_for_a_run(
+    avx512: bool, minutes: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(doctor, "backend_of", lambda name: SimpleNamespace(name="cpu"))
+    monkeypatch.setattr(doctor, "_has_avx512", lambda: avx512)
+    monkeypatch.setattr(doctor.threads, "count", lambda: 2)
+    *_, (name, check) = checks().items()
+    assert name == "so training"
+    assert check["value"] == (
+        "uses the CPU, no GPU: 24 photographs of 640 px take about "
+        f"{minutes[0]} min at `preview`, about {minutes[1]} min at `standard`, a whole run"
+    )
 
 
 def test_kernels_of_other_versions_are_counted(

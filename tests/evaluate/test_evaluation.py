@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from stages.base.stage import Report
 from stages.evaluate import evaluation
 from stages.evaluate.evaluation import (
     LARGEST_SUBSET,
@@ -31,6 +33,7 @@ from stages.scene import (
     View,
     draw_settings_of,
 )
+from stages.train.quality import _report_scores
 from tests.scenes import BACKENDS, join, splats
 from tests.small_scene import SmallScene, small_scene
 
@@ -128,6 +131,22 @@ def test_an_evaluation_at_sizes_draws_each_size_and_begins_with_the_full_one(
     assert found["full"] == evaluate(draw, views, with_flip=True)
     for name, scale in (("half", 0.5), ("quarter", 0.25)):
         assert found[name] == evaluate(draw, [view.scaled(scale) for view in views], with_flip=True)
+
+
+def test_a_python_without_flip_evaluates_without_it(
+    scene: SmallScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
+    monkeypatch.setattr("stages.evaluate.image_metrics.find_spec", lambda name: None)
+    views = load_evaluation_views(
+        scene.reconstruction.folder, scene.reconstruction.views[:1], scene.splats.draw_settings
+    )
+    (score,) = evaluate(image_renderer(scene.splats, "cpu"), views, with_flip=True)
+    assert score.flip is None
+    report = Report()
+    _report_scores({"full": [score]}, report)
+    assert "flip" not in report.metrics
+    assert report.metrics["ssim"] > 0
 
 
 def test_the_near_plane_of_the_look_decides_what_is_drawn() -> None:
