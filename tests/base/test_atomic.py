@@ -26,7 +26,8 @@ def ended() -> str:
 def test_on_windows_a_rename_that_is_refused_is_tried_again_and_maps_are_closed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    refused, real = [], os.replace
+    refused: list[Path] = []
+    real = os.replace
 
     def replace(source: Path, target: Path) -> None:
         if len(refused) < 2:

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from splatcli.app import app
 from splatcli.commands import doctor
-from stages.base import libraries
+from stages.base import libraries, threads
 from stages.raster.kernels import cache
 
 
@@ -48,7 +48,7 @@ def test_it_ends_with_what_it_means_for_a_run(
 ) -> None:
     monkeypatch.setattr(doctor, "backend_of", lambda name: SimpleNamespace(name="cpu"))
     monkeypatch.setattr(doctor, "_has_avx512", lambda: avx512)
-    monkeypatch.setattr(doctor.threads, "count", lambda: 2)
+    monkeypatch.setattr(threads, "count", lambda: 2)
     *_, (name, check) = checks().items()
     assert name == "so training"
     assert check["value"] == (
