@@ -117,6 +117,7 @@ ENTRIES = {
     "view": Entry(
         "Show the splats in a browser: orbit, fly, stand where the photographs were taken.",
         "splat view run/",
+        (AS_JSON,),
         panel="Look and measure",
     ),
     "info": Entry(

@@ -24,7 +24,9 @@ def status(
     _print(pipeline, steps, busy)
     if verify:
         pipeline.check_outputs()
-        if not console.mode.as_json:
+        if console.mode.as_json:
+            console.emit("verified")
+        else:
             console.note("All files of finished stages are as they were written.")
 
 

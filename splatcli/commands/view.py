@@ -120,7 +120,11 @@ def _save(
     first = camera_of_view(splats, results.views_of(pipeline or results.run_around(target)), camera)
     page = html.ClientPage(first, path.stem if title is None else title, background)
     html.write(path, splats, client=page)
-    console.note(f"{path}: {len(splats):,} splats, {console.size(path.stat().st_size)}.")
+    size = path.stat().st_size
+    if console.mode.as_json:
+        console.emit("saved", out=str(path), splats=len(splats), size_bytes=size)
+    else:
+        console.note(f"{path}: {len(splats):,} splats, {console.size(size)}.")
 
 
 def _items(
@@ -147,8 +151,11 @@ def _title(target: Path | None, pipeline: Pipeline | None) -> str:
 
 def _serve(server: LocalServer, count: int, open_browser: bool) -> None:
     try:
-        console.out.print(server.address)
-        console.note(f"{count:,} splats. Ctrl-C ends it.")
+        if console.mode.as_json:
+            console.emit("view", address=server.address, splats=count)
+        else:
+            console.out.print(server.address)
+            console.note(f"{count:,} splats. Ctrl-C ends it.")
         if open_browser and not open_in_browser(server.address):
             console.note("No browser could be opened; open the address yourself.")
         server.serve_forever()

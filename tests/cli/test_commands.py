@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from splatcli import api, console
-from splatcli.app import app
+from splatcli.app import ENTRIES, app
+from splatcli.arguments import AS_JSON
 from stages.base.distribution import NAME, VERSION
 from stages.base.errors import Interrupted, SplatError
 from stages.raster.gpu import device as gpu
@@ -128,6 +129,14 @@ def test_code_of_photographs_that_are_not_there_is_the_documented_one(splat) -> 
     row = next(row for row in text.splitlines() if row.startswith("| `photographs-missing`"))
     assert "photographs-missing" in result.stderr
     assert "at the path given" in row
+
+
+def test_every_command_has_json_and_says_that_outputs_were_verified(splat) -> None:
+    assert all(AS_JSON in entry.added for entry in ENTRIES.values())
+    splat("process", "photos")
+    assert [e["event"] for e in events(splat("status", "--verify", "--json"))] == [
+        *("status", "verified")
+    ]
 
 
 def test_newest_splats_are_made_from_what_lies_there(splat) -> None:
