@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -23,6 +23,26 @@ Numbers = dict[str, float | int | str]
 DrawView: TypeAlias = "Callable[[Camera], NDArray[np.uint8]]"
 
 
+@dataclass(frozen=True)
+class Earlier:
+    """The output that a run of a stage replaces, where the same version made it with equal settings
+    except `Stage.adds`. What does not depend on that setting, nor on an input that changed, may be
+    taken from it.
+
+    Args:
+        folder: whose files are as they were written.
+        settings: as plain data.
+        metrics, warnings: as reported then.
+        same_inputs: names of the inputs that have not changed.
+    """
+
+    folder: Path
+    settings: Mapping[str, Any]
+    metrics: Mapping[str, Any]
+    warnings: Sequence[Sequence[str]]
+    same_inputs: frozenset[str]
+
+
 @dataclass
 class Report:
     """Collects metrics, warnings and progress of one run of a stage.
@@ -35,6 +55,7 @@ class Report:
             write their checkpoint and raise `Interrupted`.
         preview: called with the function given to `offer`; it must not change the output.
         device: hardware that the stage ran on, for the manifest.
+        earlier: what may be taken from the output before, if anything.
     """
 
     metrics: dict[str, Any] = field(default_factory=dict)
@@ -43,6 +64,7 @@ class Report:
     stop_requested: threading.Event = field(default_factory=threading.Event)
     preview: Callable[[DrawView], None] | None = None
     device: str = "cpu"
+    earlier: Earlier | None = None
 
     def metric(self, name: str, value: Any) -> None:
         """Record one figure, JSON-serialisable, with the unit in its name (`train_seconds`)."""
@@ -84,6 +106,8 @@ class Stage:
     run(inputs, settings, folder, report): writes everything under `folder` and returns the output.
         `folder` may hold what an interrupted run of the same inputs and settings left there.
     load(folder): the output again, from a finished folder. Cheap: arrays may be loaded, images not.
+    adds: a setting whose items are made apart from each other: `run` may take those that its
+        earlier output has from `Report.earlier`, if its own output has the same bytes.
     """
 
     name: str
@@ -92,6 +116,7 @@ class Stage:
     settings_type: type
     run: Run
     load: Load
+    adds: str = ""
 
 
 def in_module(module: str) -> dict[str, Any]:

@@ -41,5 +41,6 @@ STAGE = Stage(
     version=12,
     reads=("sfm", "quantise"),
     settings_type=ExportSettings,
+    adds="formats",
     **in_module("stages.export.stage"),
 )

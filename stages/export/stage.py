@@ -8,8 +8,9 @@ here: `quantise` has fine-tuned the splats to the rounding of the formats.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from stages.base.bad_files import reading, stage_output
 from stages.base.errors import Interrupted, QualityError, SplatError
 from stages.base.stage import Report
 from stages.base.text import counted
+from stages.export.reuse import digest_of, take_file
 from stages.export.settings import ExportSettings
 from stages.formats import format_of
 from stages.formats.format_table import FORMATS
@@ -38,12 +40,13 @@ def run(
     inputs: Mapping[str, Any], settings: ExportSettings, folder: Path, report: Report
 ) -> ExportedAssets:
     """Write inputs["quantise"] in all formats into `folder`, seen by the views of inputs["sfm"].
+    Files of an earlier export that would come out the same are taken from it.
 
-    Metrics: files (how many), splats, dropped; formats: by format size_bytes, bytes_per_splat and
-    the figures of `proof.Proof`, among them verify_db (PSNR between pictures of the splats and of
-    the file, the worst camera) and the largest errors of the values; mesh: the figures of
-    `CollisionMesh`. Raises SplatError "export-verify-failed" (family QUALITY), and what keeps a
-    file from being written.
+    Metrics: files (how many), splats, dropped; formats: by format size_bytes, bytes_per_splat,
+    made_from (digest of the splats that decide the file and its figures), and the figures of
+    `proof.Proof`, among them verify_db (PSNR between pictures of the splats and of the file, the
+    worst camera) and the largest errors of the values; mesh: the figures of `CollisionMesh`. Raises
+    SplatError "export-verify-failed" (family QUALITY), and what keeps a file from being written.
     """
     quantised: QuantisedSplats = replace(inputs["quantise"], drawing=settings.drawing)
     reconstruction: Reconstruction = inputs["sfm"]
@@ -51,28 +54,30 @@ def run(
     splats, dropped = drop_undrawable(replace(quantised.splats, place=place))
     _warn_of_missing(len(splats), dropped, report)
     chosen = tuple(name for name in dict.fromkeys(settings.formats) if name in FORMATS)
-    cameras = cameras_for(splats, reconstruction.views)
-    prover_of = provers_of(quantised, cameras, settings.backend)
+    prover_of = cache(
+        lambda: provers_of(quantised, cameras_for(splats, reconstruction.views), settings.backend)
+    )
     files, figures = [], {}
     for number, name in enumerate(chosen):
         if report.stop_requested.is_set():
             raise Interrupted("stopped before a file")
-        report.progress(number, len(chosen), f"writing .{name}")
         path = folder / f"{settings.name}.{name}"
         held = replace(splats_to_write(FORMATS[name], quantised), place=place)
-        formats.write(path, held, units=reconstruction.units, views=reconstruction.views)
-        size = FORMATS[name].size_bytes(path)
-        files.append(ExportedFile(name, path.name, size))
-        figures[name] = {
-            "size_bytes": size,
-            "bytes_per_splat": round(size / max(1, len(splats)), 2),
-            # pictures are compared with all SH coefficients, values with what the file should hold
-            **_prove(prover_of(held), path, report),
-        }
-        report.progress(number + 1, len(chosen), f".{name}", verify_db=figures[name]["verify_db"])
-    for file in _write_meshes(splats, reconstruction, settings, folder, report):
-        files.append(file)
-        figures[file.format] = {"size_bytes": file.size_bytes}
+        made_from = digest_of(held, quantised.splats, quantised.plain)
+        found = take_file(name, path, made_from, report)
+        if found is None:
+            report.progress(number, len(chosen), f"writing .{name}")
+            found = _write(path, held, reconstruction, prover_of(), report)
+        found["made_from"] = made_from
+        figures[name] = found
+        files.append(ExportedFile(name, path.name, found["size_bytes"]))
+        report.progress(number + 1, len(chosen), f".{name}", verify_db=found["verify_db"])
+    meshes = _write_meshes(splats, reconstruction, settings, folder, report)
+    figures |= meshes
+    files += [
+        ExportedFile(name, f"{settings.name}.{name}", found["size_bytes"])
+        for name, found in meshes.items()
+    ]
     report_backend(report, settings.backend)
     report.metric("files", len(files))
     report.metric("splats", len(splats))
@@ -82,32 +87,54 @@ def run(
     return ExportedAssets(folder, tuple(files))
 
 
+def _write(
+    path: Path,
+    held: Splats,
+    reconstruction: Reconstruction,
+    prover_of: Callable[[Splats], Prover],
+    report: Report,
+) -> dict[str, Any]:
+    """Write a file and prove it; returns its figures. held: what it should hold. Raises SplatError
+    "export-verify-failed"."""
+    formats.write(path, held, units=reconstruction.units, views=reconstruction.views)
+    size = format_of(path).size_bytes(path)
+    return {
+        "size_bytes": size,
+        "bytes_per_splat": round(size / max(1, len(held)), 2),
+        # pictures are compared with all SH coefficients, values with what the file should hold
+        **_prove(prover_of(held), path, report),
+    }
+
+
 def _write_meshes(
     splats: Splats,
     reconstruction: Reconstruction,
     settings: ExportSettings,
     folder: Path,
     report: Report,
-) -> list[ExportedFile]:
-    """Write the requested meshes, and prove each; metric: mesh, see `CollisionMesh`.
-    Raises SplatError "export-verify-failed"."""
+) -> dict[str, dict[str, Any]]:
+    """Write the requested meshes, and prove each; returns figures by format. Metric: mesh, see
+    `CollisionMesh`. Raises SplatError "export-verify-failed"."""
     rows = mesh_formats(settings.formats)
-    if not rows:
-        return []
-
+    made_from = digest_of(splats)
+    paths = {row.ending: folder / f"{settings.name}.{row.ending}" for row in rows}
+    taken = {name: take_file(name, path, made_from, report) for name, path in paths.items()}
+    found = {name: figures for name, figures in taken.items() if figures is not None}
+    if report.earlier and found:
+        report.metric("mesh", report.earlier.metrics["mesh"])
+    if len(found) == len(paths):
+        return found
     made = make_collision_mesh(
         splats, reconstruction, settings.mesh_triangles, settings.backend, report
     )
     report.metric("mesh", made.figures)
-    files = []
-    for row in rows:
-        path = folder / f"{settings.name}.{row.ending}"
-        codec = CODECS_OF_MESHES[row.ending]
+    for name, path in paths.items():
+        codec = CODECS_OF_MESHES[name]
         codec.write(path, made.mesh, reconstruction.units)
         if fault := codec.fault_of(path, made.mesh):
             raise _failed(path, fault, "mesh")
-        files.append(ExportedFile(row.ending, path.name, path.stat().st_size))
-    return files
+        found[name] = {"size_bytes": path.stat().st_size, "made_from": made_from}
+    return found
 
 
 def _warn_of_missing(count: int, dropped: int, report: Report) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -77,26 +77,38 @@ class FormatFinetuning:
         plain = FineTuner(views, extent, backend, report, dropout, half_size=True)
         return cls(rounding, plain, deciding_views, view_counts, settings, report)
 
-    def to_plain_drawing(self, splats: Splats) -> Splats | None:
+    def to_plain_drawing(self, splats: Splats, earlier: Splats | None = None) -> Splats | None:
         """The splats for formats that are drawn without opacity compensation; None if no such
-        format is requested, or `splats` are drawn so. Raises Interrupted."""
+        format is requested, or `splats` are drawn so. earlier: the same of an earlier run, if it
+        made them. Raises Interrupted."""
         rows = [FORMATS[name] for name in self.settings.formats]
         if not splats.draw_settings.antialias or all(
             row.holds_antialiased(self.settings.drawing) for row in rows
         ):
             return None
+        if earlier is not None:
+            return earlier
         self.report.progress(0, 1, "fine-tuning to plain drawing")
         found = without_compensation(drop_undrawable(splats)[0], self.plain.cameras)
         return self.plain.finetune(found, self.settings.plain_steps, self.view_counts)
 
-    def to_rounding(self, quantised: QuantisedSplats) -> dict[str, Splats]:
+    def to_rounding(
+        self,
+        quantised: QuantisedSplats,
+        earlier: Mapping[str, Splats],
+        earlier_figures: Mapping[str, dict[str, float]],
+    ) -> dict[str, Splats]:
         """By format that rounds, the splats that its file should hold. Metric: formats, by format
-        the figures of `to_rounding_of`. Raises Interrupted."""
+        the figures of `to_rounding_of`. earlier, earlier_figures: the same of formats that need not
+        be made again. Raises Interrupted."""
         if not (self.settings.rounding_steps and len(drop_undrawable(quantised.splats)[0])):
             return {}
         names = [name for name in self.settings.formats if FORMATS[name].needs_finetuning]
         found, figures = {}, {}
         for number, name in enumerate(names):
+            if name in earlier and name in earlier_figures:
+                found[name], figures[name] = earlier[name], earlier_figures[name]
+                continue
             self.report.progress(number, len(names), f"fine-tuning to .{name}")
             found[name], figures[name] = self.to_rounding_of(FORMATS[name], quantised)
         self.report.metric("formats", figures)

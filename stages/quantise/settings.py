@@ -66,5 +66,6 @@ STAGE = Stage(
     version=14,
     reads=("sfm", "train", "prune"),
     settings_type=QuantiseSettings,
+    adds="formats",
     **in_module("stages.quantise.stage"),
 )

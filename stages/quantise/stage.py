@@ -76,18 +76,23 @@ def run(
     trained: TrainedSplats = inputs["train"]
     reconstruction = inputs["sfm"].with_cameras(trained.cameras)
     decider, evaluator = _measures(reconstruction, splats.draw_settings, settings, report)
-    kept, by_degree, threshold = _choose_sh_degrees(splats, settings, decider)
+    earlier = _Earlier.of(report)
+    kept, by_degree, threshold = (
+        earlier.sh if earlier else _choose_sh_degrees(splats, settings, decider)
+    )
     finetuning = FormatFinetuning.of(
         kept, reconstruction, trained.dropout, settings, decider.views, report
     )
-    plain = finetuning.to_plain_drawing(kept)
-    flat = _flat_colours(kept if plain is None else plain, reconstruction, settings)
+    plain = finetuning.to_plain_drawing(kept, earlier.quantised.plain if earlier else None)
+    if earlier and (earlier.quantised.plain is None) != (plain is None):
+        earlier = None  # all that follows depends on it
+    flat = earlier.quantised.flat_dc if earlier else None
+    if not earlier:
+        flat = _flat_colours(kept if plain is None else plain, reconstruction, settings)
     quantised = QuantisedSplats(kept, None, flat, plain=plain, drawing=settings.drawing)
-    bits, sog_db = None, None
-    if _SOG in settings.formats:
-        sog = splats_to_write(FORMATS[_SOG], quantised)
-        bits, sog_db = choose_bits(sog, decider.psnr, settings.sog_loss_db)
-    figures = _figures(splats, quantised, bits, evaluator)
+    bits, sog_db = _sog_bits(quantised, settings, decider, earlier)
+    figures = earlier.figures if earlier else _figures(splats, quantised, evaluator)
+    figures = {**figures, "bits": bits, "measured_on": evaluator.what}
     decisions: dict[str, object] = {
         **figures,
         "psnr_sog_training_db": sog_db,
@@ -104,14 +109,65 @@ def run(
     report.metric("evaluated_side_px", splats.draw_settings.side)
     report_backend(report, settings.backend)
     quantised = replace(quantised, sog_bits=bits)
-    quantised = replace(quantised, finetuned=finetuning.to_rounding(quantised))
+    finetuned = finetuning.to_rounding(
+        quantised,
+        earlier.quantised.finetuned if earlier else {},
+        earlier.finetuning if earlier else {},
+    )
+    quantised = replace(quantised, finetuned=finetuned)
     _save(folder, quantised, decisions)
     return quantised
 
 
-def _figures(
-    splats: Splats, quantised: QuantisedSplats, bits: dict[str, int] | None, evaluator: _Measure
-) -> dict[str, object]:
+@dataclass(frozen=True)
+class _Earlier:
+    """What was decided when other formats were requested, and holds for these as well.
+
+    Attributes:
+        quantised: as then.
+        sh: what `_choose_sh_degrees` returns.
+        sog: what `_sog_bits` returned.
+        figures: what `_figures` returned.
+        finetuning: the figures of fine-tuning by format.
+    """
+
+    quantised: QuantisedSplats
+    sh: tuple[Splats, dict[int, float], float]
+    sog: tuple[dict[str, int] | None, float | None]
+    figures: dict[str, object]
+    finetuning: Mapping[str, dict[str, float]]
+
+    @classmethod
+    def of(cls, report: Report) -> _Earlier | None:
+        earlier = report.earlier
+        if earlier is None or earlier.same_inputs < {"sfm", "train", "prune"}:
+            return None
+        quantised = load(earlier.folder)
+        told = json.loads((earlier.folder / _DECISIONS).read_text(encoding="utf-8"))
+        sog = told["bits"], told.pop("psnr_sog_training_db")
+        by_degree = {int(degree): db for degree, db in told.pop("psnr_by_sh_degree_db").items()}
+        sh = quantised.splats, by_degree, told.pop("colour_loss_of_255")
+        for name in ("sh_loss_db", "drawing", "views", "bits", "measured_on"):
+            del told[name]
+        return cls(quantised, sh, sog, told, earlier.metrics.get("formats", {}))
+
+
+def _sog_bits(
+    quantised: QuantisedSplats,
+    settings: QuantiseSettings,
+    decider: _Measure,
+    earlier: _Earlier | None,
+) -> tuple[dict[str, int] | None, float | None]:
+    """What `choose_bits` returns; (None, None) if no .sog is requested."""
+    if _SOG not in settings.formats:
+        return None, None
+    if earlier and earlier.quantised.sog_bits is not None:
+        return earlier.sog
+    sog = splats_to_write(FORMATS[_SOG], quantised)
+    return choose_bits(sog, decider.psnr, settings.sog_loss_db)
+
+
+def _figures(splats: Splats, quantised: QuantisedSplats, evaluator: _Measure) -> dict[str, object]:
     """The figures of the decision, for the report and for people. splats: before it."""
     kept, plain, row = quantised.splats, quantised.plain, FORMATS["splat"]
     return {
@@ -123,8 +179,6 @@ def _figures(
         "splats_by_sh_degree": [
             int((kept.sh_degrees == d).sum()) for d in range(kept.sh_degree + 1)
         ],
-        "bits": bits,
-        "measured_on": evaluator.what,
     }
 
 

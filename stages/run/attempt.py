@@ -20,7 +20,7 @@ from stages.run.digests import combined_digest, record_files
 from stages.run.failures import as_splat_error
 from stages.run.listener import Listener
 from stages.run.manifest import Manifest, json_value, write_json
-from stages.run.request import Request
+from stages.run.request import Request, earlier_of
 from stages.run.workspace import BOOKKEEPING, USAGE, Workspace
 
 _NOTE_EVERY_S = 5.0
@@ -41,7 +41,8 @@ def attempt(
     system, and whatever else the stage raises.
     """
     stage = request.stage
-    report = Report(stop_requested=stop)
+    done = Manifest.read(space.final)
+    report = Report(stop_requested=stop, earlier=earlier_of(request, done, space.final))
     report.listener = lambda label, done, total, numbers: listener.progressed(
         stage, label, done, total, numbers
     )

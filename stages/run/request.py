@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 from stages.base.settings import settings_of
-from stages.base.stage import Stage
+from stages.base.stage import Earlier, Stage
 from stages.base.text import counted
-from stages.run.digests import FileRecords, differences
+from stages.run.digests import FileRecords, damage, differences
 from stages.run.manifest import Manifest, json_value, write_json
 
 REQUEST = "request.json"
@@ -69,6 +69,21 @@ def settings_from_data(settings_type: type, data: Mapping[str, Any]) -> Any:
             if value is not None and Path in (hints[field.name], *get_args(hints[field.name])):
                 known[field.name] = Path(value)
     return settings_type(**known)
+
+
+def earlier_of(request: Request, done: Manifest | None, folder: Path) -> Earlier | None:
+    """What the stage may take from its finished output in `folder`; see `Earlier`. None if there is
+    nothing, or a file is not as it was written. Raises OSError."""
+    stage = request.stage
+    if not stage.adds or done is None or done.version != stage.version:
+        return None
+    deciding = {one.name for one in settings_of(stage.settings_type) if one.affects_output}
+    if any(request.settings[n] != done.settings.get(n) for n in deciding - {stage.adds}):
+        return None
+    if damage(folder, done.outputs, read_all=True):
+        return None
+    same = frozenset(n for n, digest in request.inputs.items() if done.inputs.get(n) == digest)
+    return Earlier(folder, done.settings, done.metrics, done.warnings, same)
 
 
 def why_again(request: Request, done: Manifest) -> list[str]:

@@ -12,7 +12,7 @@ import pytest
 from stages import formats
 from stages.base.errors import Family, SplatError
 from stages.base.settings import check_settings
-from stages.base.stage import Report
+from stages.base.stage import Earlier, Report
 from stages.export import stage as export
 from stages.export.settings import ExportSettings
 from stages.formats import FORMATS
@@ -31,9 +31,13 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> SmallScene:
 
 
 def exported(
-    scene: SmallScene, folder: Path, splats: Splats | None = None, **settings: Any
+    scene: SmallScene,
+    folder: Path,
+    splats: Splats | None = None,
+    earlier: Earlier | None = None,
+    **settings: Any,
 ) -> tuple[ExportedAssets, Report]:
-    report = Report()
+    report = Report(earlier=earlier)
     splats = scene.splats if splats is None else splats
     splats = replace(splats, origin=scene.reconstruction.origin)
     inputs = {
@@ -70,6 +74,41 @@ def test_the_capture_units_and_origin_travel_with_the_files(
         back = formats.read(tmp_path / f"scene.{name}")
         np.testing.assert_array_equal(back.origin, [5e5, 0, -4])
     assert b"units: metres" in (tmp_path / "scene.ply").read_bytes()
+
+
+def test_a_further_format_is_all_that_is_written(
+    scene: SmallScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fuse, "VOXELS", 24**3)
+    before = ("ply", "splat", "gltf", "mesh.glb")
+    for folder in ("first", "whole", "added", "changed"):
+        (tmp_path / folder).mkdir()
+    _, first = exported(scene, tmp_path / "first", formats=before)
+    earlier = Earlier(tmp_path / "first", {}, first.metrics, first.warnings, frozenset({"sfm"}))
+    _, whole = exported(scene, tmp_path / "whole", formats=(*before, "sog"))
+    written: list[str] = []
+    write = formats.write
+
+    def noted(path: Path, *given: Any, **more: Any) -> int:
+        written.append(path.name)
+        return write(path, *given, **more)
+
+    monkeypatch.setattr(formats, "write", noted)
+    with monkeypatch.context() as patch:
+        patch.setattr(export, "make_collision_mesh", lambda *_: 1 / 0)
+        _, added = exported(scene, tmp_path / "added", earlier=earlier, formats=(*before, "sog"))
+    assert written == ["scene.sog"]
+    assert sorted(added.warnings) == sorted(whole.warnings)
+    assert added.metrics == whole.metrics
+    names = sorted(path.name for path in (tmp_path / "whole").iterdir())
+    assert sorted(path.name for path in (tmp_path / "added").iterdir()) == names
+    for name in names:
+        assert (tmp_path / "added" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+    for changed, inputs in ((scene.splats.take(slice(1, None)), {"sfm"}), (None, set())):
+        written.clear()
+        other = replace(earlier, same_inputs=frozenset(inputs))
+        exported(scene, tmp_path / "changed", changed, other, formats=("ply", "splat"))
+        assert written == ["scene.ply", "scene.splat"]
 
 
 @pytest.mark.slow

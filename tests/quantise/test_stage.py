@@ -12,7 +12,7 @@ import pytest
 
 from stages.base.errors import Family, SplatError
 from stages.base.settings import check_settings
-from stages.base.stage import Report
+from stages.base.stage import Earlier, Report
 from stages.evaluate.evaluation import load_evaluation_views, mean_psnr_db
 from stages.evaluate.sh import sufficient_degrees, truncate_sh, truncation_rms
 from stages.formats.format_table import FORMATS
@@ -259,3 +259,60 @@ def test_a_sog_gets_no_more_bits_than_its_views_show(scene: SmallScene, tmp_path
 def test_bits_are_measured_only_where_a_sog_is_requested(scene: SmallScene, tmp_path: Path) -> None:
     _, metrics = decide(scene, tmp_path, formats=())
     assert metrics["bits"] is None
+
+
+@pytest.mark.parametrize("more", [("sog",), ("sog", "splat", "spz")])
+def test_a_further_format_measures_only_what_it_needs_and_gives_the_same_bytes(
+    scene: SmallScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, more: tuple[str, ...]
+) -> None:
+    inputs = {
+        "sfm": scene.reconstruction,
+        "train": TrainedSplats(scene.splats.with_antialias(True)),
+        "prune": scene.splats.with_antialias(True),
+    }
+
+    def run(folder: str, formats: tuple[str, ...], earlier: Earlier | None = None) -> Report:
+        report = Report(earlier=earlier)
+        settings = QuantiseSettings(formats=formats, plain_steps=2, rounding_steps=1)
+        (tmp_path / folder).mkdir()
+        quantise.run(inputs, settings, tmp_path / folder, report)
+        return report
+
+    first, whole = run("first", ("ply", "splat")), run("whole", ("ply", *more))
+    earlier = Earlier(tmp_path / "first", {}, first.metrics, (), frozenset(inputs))
+    for name in ("_choose_sh_degrees", "_figures", "_flat_colours"):
+        monkeypatch.setattr(quantise, name, lambda *_: 1 / 0)
+    added = run("added", ("ply", *more), earlier)
+    assert added.metrics == whole.metrics
+    found = [
+        {path.relative_to(tmp_path / folder): path.read_bytes() for path in paths}
+        for folder in ("whole", "added")
+        for paths in [(tmp_path / folder).rglob("*.*")]
+    ]
+    assert found[0] == found[1]
+
+
+def test_a_further_format_that_is_drawn_in_another_way_takes_the_sh_degrees_alone(
+    scene: SmallScene, tmp_path: Path
+) -> None:
+    inputs = {
+        "sfm": scene.reconstruction,
+        "train": TrainedSplats(scene.splats.with_antialias(True)),
+        "prune": scene.splats.with_antialias(True),
+    }
+    reports: dict[str, Report] = {}
+    for folder, formats in (("first", ("spz",)), ("whole", ("spz", "splat")), ("added", None)):
+        first = reports.get("first")
+        earlier = None
+        if formats is None and first is not None:
+            earlier = Earlier(tmp_path / "first", {}, first.metrics, (), frozenset(inputs))
+        settings = QuantiseSettings(
+            formats=formats or ("spz", "splat"), plain_steps=2, rounding_steps=1
+        )
+        reports[folder] = Report(earlier=earlier)
+        (tmp_path / folder).mkdir()
+        quantise.run(inputs, settings, tmp_path / folder, reports[folder])
+    assert reports["added"].metrics == reports["whole"].metrics
+    for path in (tmp_path / "whole").rglob("*.*"):
+        same = tmp_path / "added" / path.relative_to(tmp_path / "whole")
+        assert same.read_bytes() == path.read_bytes()

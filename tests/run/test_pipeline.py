@@ -21,6 +21,7 @@ import pytest
 from stages import formats
 from stages.base.errors import Family, Interrupted, SplatError
 from stages.base.memory import resident_mib
+from stages.base.stage import Earlier
 from stages.cameras import nerfstudio
 from stages.run import manifest
 from stages.run.failures import as_splat_error
@@ -132,6 +133,36 @@ def test_changed_setting_runs_its_stage_and_those_after_it(finished: Pipeline) -
         "sign": "count runs again first",
     }
     assert ran(finished, settings) == ["count", "sign"]
+
+
+def test_a_stage_gets_its_earlier_output_where_only_the_setting_that_adds_to_it_changed(
+    photos: Path, run_folder: Path
+) -> None:
+    seen: list[Earlier | None] = []
+
+    def sign(inputs, settings, folder, report) -> None:
+        seen.append(report.earlier)
+        (folder / "signed.txt").write_text(" ".join(settings.names))
+
+    copy, count, last = fake_stages(sign=sign)
+    pipeline = Pipeline(run_folder, photos, [copy, count, dataclasses.replace(last, adds="names")])
+    pipeline.run()
+    pipeline.run({"sign": SignSettings(names=("a", "b", "c"))})
+    pipeline.run({"count": CountSettings(iterations=5)})
+    flip_bit(run_folder / "3-sign" / "signed.txt")
+    pipeline.run({"sign": SignSettings(names=("a",))})
+    first, added, other_input, damaged = seen
+    assert first is None
+    assert damaged is None
+    assert added
+    assert added.folder == run_folder / "3-sign"
+    assert added.settings == {"names": ["a", "b"]}
+    assert added.same_inputs == {"count"}
+    assert other_input
+    assert not other_input.same_inputs
+    newer = dataclasses.replace(last, adds="names", version=2)
+    Pipeline(run_folder, photos, [copy, count, newer]).run()
+    assert seen[-1] is None
 
 
 def test_settings_are_remembered(finished: Pipeline, run_folder: Path) -> None:
