@@ -143,13 +143,13 @@ class _Earlier:
         if earlier is None or earlier.same_inputs < {"sfm", "train", "prune"}:
             return None
         quantised = load(earlier.folder)
-        told = json.loads((earlier.folder / _DECISIONS).read_text(encoding="utf-8"))
-        sog = told["bits"], told.pop("psnr_sog_training_db")
-        by_degree = {int(degree): db for degree, db in told.pop("psnr_by_sh_degree_db").items()}
-        sh = quantised.splats, by_degree, told.pop("colour_loss_of_255")
+        found = json.loads((earlier.folder / _DECISIONS).read_text(encoding="utf-8"))
+        sog = found["bits"], found.pop("psnr_sog_training_db")
+        by_degree = {int(degree): db for degree, db in found.pop("psnr_by_sh_degree_db").items()}
+        sh = quantised.splats, by_degree, found.pop("colour_loss_of_255")
         for name in ("sh_loss_db", "drawing", "views", "bits", "measured_on"):
-            del told[name]
-        return cls(quantised, sh, sog, told, earlier.metrics.get("formats", {}))
+            del found[name]
+        return cls(quantised, sh, sog, found, earlier.metrics.get("formats", {}))
 
 
 def _sog_bits(
