@@ -64,8 +64,8 @@ def test_command_in_the_text_has_its_options(words: list[str]) -> None:
 
 def test_other_commands_of_the_documentation_are_known() -> None:
     """Blocks hold splat, pip, pytest and the tools of this repository, and nothing else."""
-    known = ("splat", "pip", "pytest", "python", "ruff", "mypy", "pre-commit", "mkdocs", ".")
-    known += ("uv", "pipx")
+    tools = ("pytest", "python", "ruff", "mypy", "pre-commit", "mkdocs", ".")
+    known = ("splat", "pip", "uv", "pipx", *tools)
     for page in (*GUIDE, ROOT / "CONTRIBUTING.md"):
         for line in bash_lines(page):
             assert line.split()[0] in known, f"{page_id(page)}: {line}"
