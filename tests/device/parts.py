@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 
-PYTEST = ("-m", "pytest", "--noconftest", "-p", "no:cacheprovider", "-q", "-m", "gpu")
+PYTEST = ("-m", "pytest", "--noconftest", "-p", "no:cacheprovider", "-m", "gpu")
 TESTED = ("tests/raster/test_gpu.py", "tests/train/steps/test_gpu.py")
 # What the interpreter can do of these in a minute.
 TOY_TESTED = ("-n", "0", "-k", "equal_depths or the_same_twice")
@@ -49,7 +49,8 @@ def own(name: str, limit_s: float, *words: str, module: str = "", **how: str | b
 
 
 def tests_part(limit_s: float) -> Part:
-    more = ("-n", "6", "-p", "no:randomly", "-m", "gpu")
+    # a line for each test, so that what was done is known where time runs out
+    more = ("-n", "6", "--dist", "load", "-v", "-k", "not compiles_within")
     words = (*PYTEST, *TESTED, "--durations=5", "--timeout=100")
     return Part("tests", limit_s, (*words, *more), group="correct", toy=TOY_TESTED)
 
@@ -68,7 +69,7 @@ FIRST = (
     own("theirs", 45, "--bundle", "BUNDLE", needs="build_theirs"),
     own("host", 40),
     own("sweep", 50, "--sweep", "1", module="steps"),
-    own("large", 60, "--large", "1", module="hostile"),
+    own("large", 90, "--large", "1", module="hostile"),
 )
 SECOND = (
     own("versions", 30),

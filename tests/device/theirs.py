@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.device.build_theirs import environment
+from tests.device.build_theirs import environment, folder
 from tests.device.results import Results, asked
 
 COUNTS = (100_000, 1_000_000, 3_000_000)
@@ -95,6 +95,9 @@ def theirs(arrays: Any, where: Any, rounds: int, packed: bool, image: Any) -> di
 
 def main() -> None:
     options, results = asked(__doc__, "--bundle")
+    if not options.toy and not any(folder().rglob("gsplat_cuda.so")):
+        results.row("gsplat", "SKIPPED: it was not built")
+        return
     if importlib.util.find_spec("gsplat") is None or "TORCH_EXTENSIONS_DIR" not in os.environ:
         words = [sys.executable, "-m", "tests.device.theirs", *sys.argv[1:]]
         if os.environ.get("SPLAT_THEIRS"):

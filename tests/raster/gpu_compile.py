@@ -34,7 +34,7 @@ POINTERS = {
 }
 WHOLE = (
     *("n", "width", "height", "tiles_x", "tiles", "capacity", "entries", "room"),
-    *("columns", "used", "active", "largest_step"),
+    *("columns", "used", "active", "largest_step", "tile"),
 )
 REALS = ("red", "green", "blue", "weight", "unit", "ndc_x", "ndc_y")
 SCENE = {"COEFFICIENTS": 16, "SMOOTH": False, "ANTIALIAS": False}

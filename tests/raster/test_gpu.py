@@ -6,8 +6,10 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import re
 import shutil
 import subprocess
+import sysconfig
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
@@ -18,6 +20,8 @@ import torch
 
 pytest.importorskip("triton")
 
+from triton.runtime.errors import InterpreterError, OutOfResources
+
 from stages.base.errors import SplatError
 from stages.evaluate.contribution import measure_contributions
 from stages.evaluate.evaluation import EvaluationView
@@ -25,7 +29,7 @@ from stages.raster import backends
 from stages.raster.backends import backend_of, rasteriser_of
 from stages.raster.definition import RasterSettings, splat_arrays
 from stages.raster.draw import renderer
-from stages.raster.gpu import device
+from stages.raster.gpu import device, inner
 from stages.raster.gpu.rasteriser import GpuRasteriser
 from stages.raster.reference_rasteriser import ReferenceRasteriser
 from stages.run import results
@@ -52,7 +56,7 @@ def poisoned_memory() -> Iterator[None]:
     torch.use_deterministic_algorithms(False)
 
 
-@pytest.mark.parametrize("tile", [16, 32])
+@pytest.mark.parametrize("tile", [8, 16, 32])
 @pytest.mark.parametrize(("size", "antialias"), [((1, 1), False), ((47, 33), True)])
 def test_pictures_and_every_gradient_agree(size, antialias, tile):
     scene, view = cloud(60, size[0], size[1], 3), camera(*size)
@@ -204,18 +208,40 @@ def test_auto_passes_the_interpreter_over_and_says_why(monkeypatch):
         ("no_triton", "Triton is not installed"),
         ("cpu_build", "built for the CPU alone"),
         ("no_card", "no GPU found"),
-        ("old_driver", "NVIDIA's driver 470.42.01 is too old for CUDA 13.0"),
+        ("old_driver", "NVIDIA's driver 470.42.01 is too old for CUDA 13.0.*580 or newer"),
         ("amd_card", "an AMD card is here, and torch is built for NVIDIA's"),
         ("nvidia_card", "an NVIDIA card is here, and torch is built for AMD's"),
         ("busy_card", "all CUDA-capable devices are busy"),
-        ("old_card", "too old"),
-        ("no_compiler", "no C compiler"),
+        ("old_card", r"Old Card \(sm_70\) is too old for torch"),
+        ("new_card", r"\(sm_130\) is too old for torch .* or too new: sm_75, sm_90"),
+        ("no_compiler", "neither gcc nor clang found"),
+        ("other_compiler", "CC names no-such-compiler, which is not there"),
+        ("no_headers", "no Python.h in .*: install python3-dev"),
+        ("bad_kernel", "a first kernel failed: CalledProcessError: Command 'gcc'"),
+        ("next_card", ""),
         ("", ""),
     ],
 )
 def test_what_is_missing_is_named(fault, said, monkeypatch, tmp_path):
     monkeypatch.delenv("TRITON_INTERPRET", raising=False)
-    monkeypatch.setenv("CC", "" if fault == "no_compiler" else "cc")
+    compiler = {"no_compiler": "", "other_compiler": "no-such-compiler"}.get(fault, "sh")
+    monkeypatch.setenv("CC", compiler)
+    headers = tmp_path / "include"
+    headers.mkdir()
+    if fault != "no_headers":
+        (headers / "Python.h").touch()
+    monkeypatch.setattr(sysconfig, "get_paths", lambda scheme: {"include": str(headers)})
+    device._trial.cache_clear()
+
+    def trial():
+        if fault == "bad_kernel":
+            raise subprocess.CalledProcessError(1, "gcc")
+
+    monkeypatch.setattr("stages.raster.gpu.inner.trial", trial)
+    architectures = ["sm_75", "sm_90", "compute_90"]
+    if fault == "new_card":
+        architectures.pop()
+    monkeypatch.setattr(torch.cuda, "get_arch_list", lambda: architectures)
     other = fault in ("cpu_build", "nvidia_card")
     monkeypatch.setattr(torch.version, "cuda", None if other else "13.0")
     monkeypatch.setattr(torch.version, "hip", "7.1" if fault == "nvidia_card" else None)
@@ -229,19 +255,19 @@ def test_what_is_missing_is_named(fault, said, monkeypatch, tmp_path):
     if fault == "amd_card":
         amd.write_text("")
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "Old Card")
-    old = (5, 2) if fault == "old_card" else (9, 0)
+    capability_of = {"old_card": (7, 0), "new_card": (13, 0), "next_card": (9, 3)}
 
     def capability():
         if fault == "busy_card":
             raise RuntimeError("CUDA error: all CUDA-capable devices are busy or unavailable")
-        return old
+        return capability_of.get(fault, (9, 0))
 
     monkeypatch.setattr(torch.cuda, "get_device_capability", capability)
     if fault == "no_triton":
         monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     if fault == "no_compiler":
         monkeypatch.setattr(shutil, "which", lambda name: None)
-    assert said in device.missing()
+    assert re.search(said, device.missing())
     assert bool(device.missing()) == bool(said)
     assert backend_of("auto").name == ("cpu" if said else "gpu")
     if said:
@@ -261,6 +287,53 @@ def test_what_a_gpu_made_is_looked_at_without_one(monkeypatch):
     assert results.backend_of_run(None) == "auto"
 
 
+@pytest.mark.parametrize(("size", "tile"), [((480, 358), 8), ((1280, 800), 16)])
+def test_small_pictures_have_small_tiles(size, tile):
+    rasteriser = GpuRasteriser(16)
+    rasteriser.tile = None
+    view = rasteriser.view(camera(*size), SETTINGS)
+    assert rasteriser._tile(view) == tile
+
+
+@pytest.mark.parametrize(
+    ("card", "fast"), [((9, 0), True), ((8, 9), False), ("gfx942", True), ("gfx1100", False)]
+)
+def test_cards_with_few_float64_units_compute_footprints_in_float32(card, fast, monkeypatch):
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+    amd = isinstance(card, str)
+    monkeypatch.setattr(torch.version, "hip", "7.1" if amd else None)
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: card)
+    about = SimpleNamespace(name="Card", total_memory=2**34, gcnArchName=card)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda number: about)
+    assert device.float64_is_fast() == fast
+    assert ("float32 footprints" in device.describe()) == (not fast)
+
+
+def test_a_small_kernel_tells_whether_kernels_run():
+    inner.trial()
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (RuntimeError("Triton Error [CUDA]: an illegal memory access was encountered"), "illegal"),
+        (RuntimeError("CUDA error: device-side assert triggered"), "assert"),
+        (OutOfResources(300_000, 232_448, "shared memory"), "out of resource: shared memory"),
+        (subprocess.CalledProcessError(1, ["gcc", "main.c"]), "main.c"),
+    ],
+)
+def test_what_a_device_fails_with_is_told_as_what_it_is(error, said):
+    with pytest.raises(SplatError, match=said) as caught, device.gpu_errors_explained(1):
+        raise error
+    assert caught.value.code == "raster-gpu-failed"
+
+
+def test_faults_of_the_program_are_not_the_devices():
+    for error in (RuntimeError("shapes differ"), InterpreterError("no such name"), KeyError("x")):
+        with pytest.raises(type(error)), device.gpu_errors_explained(1):
+            raise error
+
+
 def test_memory_that_runs_out_names_the_cap_that_would_fit():
     with pytest.raises(SplatError) as caught, device.gpu_errors_explained(1_000_000):
         raise torch.OutOfMemoryError("CUDA out of memory")
@@ -269,7 +342,7 @@ def test_memory_that_runs_out_names_the_cap_that_would_fit():
     nearly = device.out_of_memory(1_000_000, free=0, held=4 << 30, total=8 << 30)
     assert nearly.fits == 800_000
     far = device.out_of_memory(10_000_000, free=1 << 30, held=3 << 30, total=8 << 30)
-    assert "About 2,576,980 would fit" in far.wanted
+    assert "About 2,273,806 would fit" in far.wanted
 
 
 def test_a_gpu_that_is_busy_is_named():

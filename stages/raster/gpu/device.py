@@ -5,23 +5,29 @@ torch and Triton are imported at first use.
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import os
 import re
 import shutil
+import subprocess
+import sysconfig
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 from stages.base.errors import ResourceError
 from stages.raster.definition import MemoryFull
 
 INSTALL = "docs/guide/gpu.md says which build of torch to install."
-_OLDEST = (7, 0)  # compute capability that Triton compiles for
-BYTES_A_SPLAT = 1500  # of training, with degree 3 and 4 tiles a splat: docs/experiments/gpu.md
+BYTES_A_SPLAT = 1700  # of training and densification, degree 3: docs/experiments/gpu.md
+_DRIVERS = {"13": "580", "12": "525"}  # the oldest of NVIDIA's for a major version of CUDA
+_FAST_FLOAT64 = ((8, 0), (9, 0), (10, 0))  # compute capabilities
 _NVIDIA, _AMD = Path("/proc/driver/nvidia/version"), Path("/dev/kfd")  # there with their drivers
-_COMPILERS = ("cc", "gcc", "clang")
+_COMPILERS = ("gcc", "clang")  # that Triton looks for
+_FAULTS = ("CUDA error", "HIP error", "Triton Error")
 
 
 def interpreted() -> bool:
@@ -45,20 +51,68 @@ def missing() -> str:
     if not torch.cuda.is_available():
         return _unseen(torch.version.cuda)
     try:
-        if torch.version.cuda and torch.cuda.get_device_capability() < _OLDEST:
-            return f"{torch.cuda.get_device_name()} is too old for Triton"
+        unserved = _unserved() if torch.version.cuda else ""
     except RuntimeError as error:  # another program may use it exclusively
-        return f"the GPU does not answer: {str(error).splitlines()[0]}"
-    if not os.environ.get("CC") and not any(map(shutil.which, _COMPILERS)):
-        return "no C compiler found, which Triton needs once to launch its kernels"
+        return f"the GPU does not answer: {_first_line(error)}"
+    return unserved or _no_compiler() or _trial()
+
+
+def _unserved() -> str:
+    """Why torch's build does not run on this NVIDIA card; "" if it does."""
+    import torch
+
+    major, minor = torch.cuda.get_device_capability()
+    built_for = torch.cuda.get_arch_list()
+    served = [re.fullmatch(r"(sm|compute)_(\d+)(\d)[af]?", name) for name in built_for]
+    for kind, *digits in (found.groups() for found in served if found):
+        architecture = tuple(map(int, digits))
+        # machine code runs within a generation, PTX on every later one
+        if architecture <= (major, minor) and (kind == "compute" or architecture[0] == major):
+            return ""
+    if not built_for:
+        return ""  # torch does not know
+    card = f"{torch.cuda.get_device_name()} (sm_{major}{minor})"
+    return f"{card} is too old for torch {torch.__version__}, or too new: {', '.join(built_for)}"
+
+
+def _no_compiler() -> str:
+    """Why Triton cannot build the launcher of its kernels, for which it needs C; "" if it can."""
+    if os.name == "nt":
+        return ""  # triton-windows brings a compiler
+    named = os.environ.get("CC")
+    if not any(map(shutil.which, (named,) if named else _COMPILERS)):
+        what = f"CC names {named}, which is not there" if named else "neither gcc nor clang found"
+        return f"{what}: Triton needs a C compiler once to launch its kernels"
+    scheme = sysconfig.get_default_scheme().replace("posix_local", "posix_prefix")
+    headers = Path(sysconfig.get_paths(scheme)["include"])
+    if not (headers / "Python.h").exists():
+        return f"no Python.h in {headers}, which Triton needs once: install python3-dev"
     return ""
+
+
+@functools.cache
+def _trial() -> str:
+    """What a small kernel fails with here; "" if it runs. Once in a process."""
+    try:
+        resolve_name("stages.raster.gpu.inner:trial")()
+    except Exception as error:  # a compiler, a driver or a card may fail in any way
+        return f"a first kernel failed: {type(error).__name__}: {_first_line(error)}"
+    return ""
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [""])[0]
 
 
 def _unseen(cuda: str | None) -> str:
     """Why torch built for CUDA (or for ROCm if None) finds no card, as far as can be known."""
     nvidia, amd = _NVIDIA.exists(), _AMD.exists()
     if cuda and nvidia:
-        return f"NVIDIA's driver {_driver()} is too old for CUDA {cuda}, or shows no card to it"
+        oldest = _DRIVERS.get(cuda.partition(".")[0], "a newer one")
+        return (
+            f"NVIDIA's driver {_driver()} is too old for CUDA {cuda}, or shows no card to it "
+            f"(it needs {oldest} or newer, or a torch built for an older CUDA)"
+        )
     if cuda and amd:
         return "an AMD card is here, and torch is built for NVIDIA's (CUDA)"
     if not cuda and nvidia:
@@ -82,7 +136,7 @@ def require() -> Any:
         raise ResourceError(
             "raster-no-gpu",
             given=f"The backend gpu cannot run here: {fault}.",
-            wanted="It takes Linux, an NVIDIA or AMD card, and a torch built for it.",
+            wanted="It takes Linux or Windows, an NVIDIA or AMD card, and a torch built for it.",
             hint=f"Choose --backend cpu. {INSTALL}",
         )
     import torch
@@ -105,7 +159,20 @@ def describe() -> str:
     kind = "ROCm" if torch.version.hip else "CUDA"
     gib = properties.total_memory / 2**30
     driver = f"driver {_driver()}, " if _driver() else ""
-    return f"{properties.name}, {gib:.0f} GiB, {driver}{kind} {runtime}, {built()}"
+    real = "" if float64_is_fast() else ", float32 footprints"
+    return f"{properties.name}, {gib:.0f} GiB, {driver}{kind} {runtime}, {built()}{real}"
+
+
+def float64_is_fast() -> bool:
+    """Whether the card has float64 units for at least a sixteenth of its float32 ones: NVIDIA's for
+    data centres up to the B200, AMD's of the Instinct line. Others have a sixty-fourth."""
+    import torch
+
+    if interpreted():
+        return True
+    if torch.version.hip:
+        return bool(torch.cuda.get_device_properties(0).gcnArchName.startswith("gfx9"))
+    return torch.cuda.get_device_capability() in _FAST_FLOAT64
 
 
 def built() -> str:
@@ -130,15 +197,23 @@ def gpu_errors_explained(splats: int) -> Iterator[None]:
         free, total = torch.cuda.mem_get_info() if torch.cuda.is_available() else (0, 0)
         held = torch.cuda.memory_reserved() if torch.cuda.is_available() else 0
         raise out_of_memory(splats, free, held, total) from error
-    except RuntimeError as error:
-        if "CUDA error" not in str(error) and "HIP error" not in str(error):
+    except Exception as error:
+        if not _is_of_device(error):
             raise
         raise ResourceError(
             "raster-gpu-failed",
-            given=f"The GPU stopped: {str(error).splitlines()[0]}.",
+            given=f"The GPU stopped: {_first_line(error)}.",
             wanted="A GPU that answers; another program may use it exclusively.",
             hint="Run `splat doctor`, see nvidia-smi or rocm-smi, or choose --backend cpu.",
         ) from error
+
+
+def _is_of_device(error: Exception) -> bool:
+    """Whether a card, its driver or a compiler failed, and not this program."""
+    kind = type(error)
+    compiling = kind.__module__.startswith("triton.") and kind.__name__ != "InterpreterError"
+    launcher = isinstance(error, subprocess.CalledProcessError)
+    return compiling or launcher or any(fault in str(error) for fault in _FAULTS)
 
 
 def out_of_memory(splats: int, free: int, held: int, total: int) -> MemoryFull:

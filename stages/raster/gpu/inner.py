@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 import triton
 import triton.language as tl
 
@@ -40,3 +41,17 @@ else:
     @triton.jit
     def top_of(x, axis: tl.constexpr):
         return tl.max(x, axis)
+
+
+@triton.jit
+def trial_kernel(out):
+    i = tl.arange(0, 32)
+    tl.store(out + i, i * 0.5)
+
+
+def trial() -> None:
+    """Compile, launch and read a small kernel; raises whatever the machine raises."""
+    out = torch.zeros(32, device="cpu" if INTERPRETED else "cuda")
+    trial_kernel[(1,)](out)
+    if out.sum().item() != 248.0:
+        raise RuntimeError("its result is wrong")

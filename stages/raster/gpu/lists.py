@@ -41,15 +41,15 @@ def shape_of(shapes, row, mask):
 
 
 @inner
-def row_span(x, y, half_x, half_y, rho, thin, tile_row, width, TILE: tl.constexpr):
+def row_span(x, y, half_x, half_y, rho, thin, tile_row, width, tile):
     """(first, number) of the tiles that an ellipse touches in a row of tiles.
 
     With eta the height in half boxes, the ellipse ends at rho eta +- thin sqrt(1 - eta^2), which
     is furthest out at +-rho. A hair more is taken than rounding could lose.
     """
-    top = tile_row * TILE + 0.5
+    top = tile_row * tile + 0.5
     low = tl.minimum(tl.maximum((top - y) / half_y - 1e-5, -1.0), 1.0)
-    high = tl.minimum(tl.maximum((top + (TILE - 1.0) - y) / half_y + 1e-5, -1.0), 1.0)
+    high = tl.minimum(tl.maximum((top + (tile - 1.0) - y) / half_y + 1e-5, -1.0), 1.0)
     out_right = tl.minimum(tl.maximum(rho, low), high)
     out_left = tl.minimum(tl.maximum(-rho, low), high)
     wide_right = thin * tl.sqrt(tl.maximum(1.0 - out_right * out_right, 0.0))
@@ -58,14 +58,14 @@ def row_span(x, y, half_x, half_y, rho, thin, tile_row, width, TILE: tl.constexp
     right = x + half_x * (rho * out_right + wide_right) + slack - 0.5
     left = x + half_x * (rho * out_left - wide_left) - slack - 0.5
     end = width - 1.0
-    first = tl.floor(tl.minimum(tl.maximum(left, 0.0), end) / TILE).to(tl.int32)
-    last = tl.floor(tl.minimum(tl.maximum(right, 0.0), end) / TILE).to(tl.int32)
+    first = tl.minimum(tl.maximum(left, 0.0), end).to(tl.int32) // tile
+    last = tl.minimum(tl.maximum(right, 0.0), end).to(tl.int32) // tile
     touches = (right >= 0.0) & (left <= end)
     return first, tl.where(touches, last - first + 1, 0)
 
 
-@triton.jit(do_not_specialize=["n", "width"])
-def count_kernel(shapes, keys, counts, n, width, TILE: tl.constexpr, BLOCK: tl.constexpr):
+@triton.jit(do_not_specialize=["n", "width", "tile"])
+def count_kernel(shapes, keys, counts, n, width, tile, BLOCK: tl.constexpr):
     """counts [n] int32: number of tiles that each splat touches, 0 if it is not visible."""
     i = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     mask = i < n
@@ -78,13 +78,15 @@ def count_kernel(shapes, keys, counts, n, width, TILE: tl.constexpr, BLOCK: tl.c
     step = most * 0.0
     while step <= most:
         tile_row = first + step
-        _, tiles = row_span(x, y, half_x, half_y, rho, thin, tile_row, width, TILE)
+        _, tiles = row_span(x, y, half_x, half_y, rho, thin, tile_row, width, tile)
         total += tl.where(tile_row <= last, tiles, 0)
         step += 1.0
     tl.store(counts + i, total, mask=mask)
 
 
-@triton.jit(do_not_specialize=["n", "tiles_x", "tiles", "width", "capacity", "largest_step"])
+@triton.jit(
+    do_not_specialize=["n", "tiles_x", "tiles", "width", "tile", "capacity", "largest_step"]
+)
 def entries_kernel(
     shapes,
     order,
@@ -93,11 +95,11 @@ def entries_kernel(
     tiles_x,
     tiles,
     width,
+    tile,
     capacity,
     largest_step,
     tile_of,
     row_of,
-    TILE: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
     """tile_of, row_of [capacity]: the tile and the splat of each entry, splats nearest first; the
@@ -122,7 +124,7 @@ def entries_kernel(
     found = left * 0 + tiles
     searching = there
     while top_of(searching.to(tl.int32), 0) > 0:
-        first, count = row_span(x, y, half_x, half_y, rho, thin, tile_row, width, TILE)
+        first, count = row_span(x, y, half_x, half_y, rho, thin, tile_row, width, tile)
         here = searching & (left < count)
         found = tl.where(here, tile_row.to(tl.int32) * tiles_x + first + left, found)
         left -= count

@@ -151,7 +151,7 @@ def put_record(record, mask, x, y, a, b, c, det, opacity, depth, width, height):
 
 
 @inner
-def put_shape(shape, mask, x, y, half_x, half_y, rho, thin, height, TILE: tl.constexpr):
+def put_shape(shape, mask, x, y, half_x, half_y, rho, thin, height, tile):
     x, y = x.to(tl.float32), y.to(tl.float32)
     half_x, half_y = half_x.to(tl.float32), half_y.to(tl.float32)
     put(shape, S_X, mask, x)
@@ -163,8 +163,8 @@ def put_shape(shape, mask, x, y, half_x, half_y, rho, thin, height, TILE: tl.con
     slack = 1e-3 + 1e-5 * half_y + 1e-6 * tl.abs(y)
     first = tl.minimum(tl.maximum(y - half_y - slack - 0.5, 0.0), height - 1.0)
     last = tl.minimum(tl.maximum(y + half_y + slack - 0.5, 0.0), height - 1.0)
-    put(shape, S_FIRST, mask, tl.floor(first / TILE))
-    put(shape, S_LAST, mask, tl.floor(last / TILE))
+    put(shape, S_FIRST, mask, tl.where(mask, first, 0.0).to(tl.int32) // tile)
+    put(shape, S_LAST, mask, tl.where(mask, last, 0.0).to(tl.int32) // tile)
 
 
 @triton.jit(do_not_specialize=["n", "columns"])
@@ -196,7 +196,7 @@ def colour_kernel(
     put(record, COLOUR + 2, mask, tl.minimum(tl.maximum(blue, 0.0), COLOUR_MAX))
 
 
-@triton.jit(do_not_specialize=["n", "columns", "used", "width", "height"])
+@triton.jit(do_not_specialize=["n", "columns", "used", "width", "height", "tile"])
 def project_kernel(
     cam,
     rows,
@@ -206,13 +206,13 @@ def project_kernel(
     used,
     width,
     height,
+    tile,
     records,
     shapes,
     keys,
     status,
     SMOOTH: tl.constexpr,
     ANTIALIAS: tl.constexpr,
-    TILE: tl.constexpr,
     REAL: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
@@ -243,7 +243,7 @@ def project_kernel(
     record = records + i * RECORD
     put_record(record, shown, px, py, a, b, c, det, opacity, z, width, height)
     rho, thin = b / tl.sqrt(a) / tl.sqrt(c), tl.sqrt(det / a / c)
-    put_shape(shapes + i * SHAPE, shown, px, py, half_x, half_y, rho, thin, height, TILE)
+    put_shape(shapes + i * SHAPE, shown, px, py, half_x, half_y, rho, thin, height, tile)
     tl.store(keys + i, tl.where(shown, z.to(tl.float32), float("inf")), mask=mask)
     found = tl.where(good, tl.where(shown, VISIBLE, OUT_OF_VIEW), CULLED)
     tl.store(status + i, found.to(tl.int8), mask=mask)

@@ -24,10 +24,12 @@ from stages.raster.definition import (
     with_smoothing,
 )
 from stages.raster.gpu import blend, gradients, lists, project
-from stages.raster.gpu.device import gpu_errors_explained, interpreted, require
+from stages.raster.gpu.device import float64_is_fast, gpu_errors_explained, interpreted, require
 from stages.scene import Camera
 
 VISIBLE, CULLED = 1, 2  # as `project_kernel` writes them
+SMALL_TILE, LARGE_TILE = 8, 16
+FEW_TILES = 4000  # large ones; an estimate: twice as many warps as blend at a time on an H100
 
 
 @dataclass(frozen=True)
@@ -106,17 +108,23 @@ class Forward:
     drawn: Drawn
 
 
-class GpuRasteriser:
-    """Draws and differentiates. tile: pixels across and down, a power of two. real: the Triton type
-    in which footprints are computed."""
+def _tiles(view: DeviceView, tile: int) -> tuple[int, int, int]:
+    across, down = -(-view.width // tile), -(-view.height // tile)
+    return across, down, across * down
 
-    def __init__(self, tile: int | None = None, real: Any = tl.float64) -> None:
+
+class GpuRasteriser:
+    """Draws and differentiates. tile: pixels across and down, a power of two; by default as the
+    picture's size demands. real: the Triton type in which footprints are computed; by default
+    float64, on a card that has few units for it float32."""
+
+    def __init__(self, tile: int | None = None, real: Any = None) -> None:
         self.device: torch.device = require()
         emulated = interpreted()
         # the interpreter's cost depends on the number of operations, not on their width
-        self.tile = tile or (32 if emulated else 16)
+        self.tile = tile or (32 if emulated else None)
         self.block = 4096 if emulated else 128
-        self.real = real
+        self.real = real or (tl.float64 if float64_is_fast() else tl.float32)
 
     def loaded(self, arrays: Arrays) -> DeviceScene:
         """See `definition.Rasteriser`."""
@@ -216,10 +224,9 @@ class GpuRasteriser:
         if n:
             project.project_kernel[self._grid(n)](
                 *(view.cam, scene.rows, scene.smoothing, n, *scene.layout),
-                *(view.width, view.height, records, shapes, keys, status),
+                *(view.width, view.height, self._tile(view), records, shapes, keys, status),
                 SMOOTH=len(scene.smoothing) > 0,
                 ANTIALIAS=view.settings.antialias,
-                TILE=self.tile,
                 REAL=self.real,
                 BLOCK=self.block,
             )
@@ -239,7 +246,7 @@ class GpuRasteriser:
             *map(float, view.settings.background),
             *(view.width, view.height, self._tiles(view)[0]),
             DEPTHS=depths,
-            TILE=self.tile,
+            TILE=self._tile(view),
             num_warps=1,
         )
         return Drawn(image, transmittance, last, records, keys, status, made)
@@ -277,8 +284,12 @@ class GpuRasteriser:
 
     def _tiles(self, view: DeviceView) -> tuple[int, int, int]:
         """(tiles across, down, all)."""
-        across, down = -(-view.width // self.tile), -(-view.height // self.tile)
-        return across, down, across * down
+        return _tiles(view, self._tile(view))
+
+    def _tile(self, view: DeviceView) -> int:
+        """Pixels across and down. A tile is one warp's work: few large ones leave a card idle."""
+        few = _tiles(view, LARGE_TILE)[2] < FEW_TILES
+        return self.tile or (SMALL_TILE if few else LARGE_TILE)
 
     def _lists(
         self,
@@ -296,7 +307,7 @@ class GpuRasteriser:
         if n:
             plain: dict[str, Any] = {"enable_fp_fusion": False}
             lists.count_kernel[self._grid(n)](
-                *(shapes, keys, counts, n, view.width), TILE=self.tile, BLOCK=self.block, **plain
+                *(shapes, keys, counts, n, view.width, self._tile(view)), BLOCK=self.block, **plain
             )
             lists.ties_kernel[self._grid(n)](
                 *(by_depth, order, ordered, scene.rows, n, *scene.layout),
@@ -311,9 +322,8 @@ class GpuRasteriser:
         row_of = torch.empty(room, dtype=torch.int32, **like)
         if room and n:
             lists.entries_kernel[self._grid(room)](
-                *(shapes, ordered, ends, n, across, tiles, view.width, room),
-                *(1 << n.bit_length(), tile_of, row_of),
-                TILE=self.tile,
+                *(shapes, ordered, ends, n, across, tiles, view.width, self._tile(view)),
+                *(room, 1 << n.bit_length(), tile_of, row_of),
                 BLOCK=self.block,
                 **plain,
             )
@@ -340,7 +350,7 @@ class GpuRasteriser:
             ),
             *(planes, out, *map(float, view.settings.background)),
             *(view.width, view.height, self._tiles(view)[0]),
-            TILE=self.tile,
+            TILE=self._tile(view),
             num_warps=1,
         )
 
