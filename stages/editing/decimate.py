@@ -15,7 +15,6 @@ the covariance without its eigenvectors, and are defined for flat splats, too.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,66 +34,35 @@ _WINDOW = 16  # splats along the curve that each is compared with
 # would choose each other.
 _TIE_BREAK = 1 + 1e-3 * np.random.default_rng(5).random(1 << 12)
 _COST_MOST = 3e38
-_REMOVAL_GROUP = 4  # of so many neighbours one may be removed in a round: they replace each other
 _BLOCK = 1 << 15
 
 
-@dataclass(frozen=True)
-class RemovalCosts:
-    """Costs of removing each of N splats, by the views that show them.
-
-    Attributes:
-        weights: [N] visible contribution of each splat, in pixels.
-        errors: [N] squared error of the pictures if this splat alone is removed; infinite for
-            splats that must stay.
-    """
-
-    weights: NDArray[np.float64]
-    errors: NDArray[np.float64]
-
-
-RemovalCostsOf = Callable[[Splats], RemovalCosts]
-
-
-def decimate(
-    splats: Splats,
-    count: int,
-    round_share: float = NEAR_ROUND_SHARE,
-    costs_of: RemovalCostsOf | None = None,
-) -> Splats:
+def decimate(splats: Splats, count: int, round_share: float = NEAR_ROUND_SHARE) -> Splats:
     """Reduce the splats to at most `count`.
 
     Args:
         splats: all drawable.
         count: the number of splats to reach, at least 1.
         round_share: the share of the splats that one round may remove.
-        costs_of: measures the cost of removing splats. Where it is given, splats are also removed
-            without a partner if that is cheaper, and merges are weighted by visibility.
     """
     number, count = 0, max(1, count)
     while len(splats) > count:
         most = max(1, min(len(splats) - count, int(round_share * len(splats))))
-        splats = _round(splats, most, number, costs_of)
+        splats = _round(splats, most, number)
         number += 1
     return splats
 
 
-def _round(splats: Splats, most: int, number: int, costs_of: RemovalCostsOf | None) -> Splats:
+def _round(splats: Splats, most: int, number: int) -> Splats:
     """One round, which removes at most `most` splats."""
     # only the order depends on this rotation, so it may be rounded
     axes = np.linalg.qr(np.random.default_rng([11, number]).normal(size=(3, 3)))[0]
     order = morton.morton_order_of(splats.means @ axes.astype(splats.means.dtype))
-    removal = costs_of(splats) if costs_of else None
-    partners, cost = _partners(splats, order, removal)
+    partners, cost = _partners(splats, order)
     places = np.arange(len(order))
     first = places[(partners[partners] == places) & (places < partners)]
-    candidates = np.concatenate([cost[first], _removal_errors(order, removal)])
-    cheapest = np.argsort(candidates, kind="stable")[:most]
-    cheapest = cheapest[np.isfinite(candidates[cheapest])]
+    pairs = first[np.argsort(cost[first], kind="stable")[:most]]
     gone = np.zeros(len(order), bool)
-    gone[cheapest[cheapest >= len(first)] - len(first)] = True
-    pairs = first[cheapest[cheapest < len(first)]]
-    pairs = pairs[~gone[pairs] & ~gone[partners[pairs]]]
     gone[partners[pairs]] = True
     into = np.full(len(order), -1, np.int32)
     into[pairs] = partners[pairs]
@@ -102,7 +70,7 @@ def _round(splats: Splats, most: int, number: int, costs_of: RemovalCostsOf | No
 
 
 def _partners(
-    splats: Splats, order: NDArray[np.intp], removal: RemovalCosts | None
+    splats: Splats, order: NDArray[np.intp]
 ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
     """By position on the curve: (position [N] of the cheapest partner, cost [N] of merging)."""
     count = len(order)
@@ -117,27 +85,15 @@ def _partners(
     for block in row_slices(count, _BLOCK):
         rows = order[block.start : block.stop + _WINDOW]
         part = Moments.of(splats, rows)
-        weights = part.masses if removal is None else removal.weights[rows]
         for step in range(1, min(_WINDOW, len(rows) - 1) + 1):
             end = min(block.stop, count - step) - block.start
             here, there = slice(0, end), slice(step, end + step)
-            cost = merge_costs(part.take(here), part.take(there), weights[here], weights[there])
+            cost = merge_costs(part.take(here), part.take(there))
             cost *= np.resize(np.roll(_TIE_BREAK, 131 * step), len(cost))
             cost = np.fmin(cost, _COST_MOST)
             offer(slice(block.start, block.start + end), cost, step)
             offer(slice(block.start + step, block.start + step + end), cost, -step)
     return partners, cheapest
-
-
-def _removal_errors(order: NDArray[np.intp], removal: RemovalCosts | None) -> NDArray[np.float64]:
-    """By position on the curve: the cost of removing the splat; infinite for all but the cheapest
-    of each group of neighbours."""
-    if removal is None:
-        return np.zeros(0)
-    errors = removal.errors[order]
-    starts = np.arange(0, len(errors), _REMOVAL_GROUP)
-    least = np.repeat(np.minimum.reduceat(errors, starts), _REMOVAL_GROUP)[: len(errors)]
-    return np.where(errors <= least, errors, np.inf)
 
 
 def _with_merged(
@@ -260,17 +216,14 @@ def merge(a: Moments, b: Moments) -> tuple[Moments, NDArray[np.float64]]:
     return Moments(means, covariances, opacities, colours, areas_of(covariances)), share
 
 
-def merge_costs(
-    a: Moments, b: Moments, weight_a: NDArray[np.float64], weight_b: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """[N] squared error of merging each pair: Ward's criterion on colours and on shapes.
-
-    weight_a, weight_b [N]: the visibility of each splat: its mass, or its contribution to views.
-    """
-    _, covariances = _mixed(a, b, a.masses / (a.masses + b.masses))
+def merge_costs(a: Moments, b: Moments) -> NDArray[np.float64]:
+    """[N] squared error of merging each pair: Ward's criterion on colours and on shapes, weighted
+    by mass."""
+    mass_a, mass_b = a.masses, b.masses
+    _, covariances = _mixed(a, b, mass_a / (mass_a + mass_b))
     grown = np.square(areas_of(covariances) / (a.areas + b.areas))
     differ = np.square(a.colours - b.colours).sum(axis=1)
-    together = weight_a * weight_b / (weight_a + weight_b)
+    together = mass_a * mass_b / (mass_a + mass_b)
     return np.asarray(together * (differ + _SHAPE_WEIGHT * grown))
 
 

@@ -17,7 +17,7 @@ from stages.base.errors import SplatError, UsageError
 from stages.base.row_slices import row_slices
 from stages.base.text import counted
 from stages.editing import expression, levels, regions, transform
-from stages.editing.decimate import FAR_ROUND_SHARE, NEAR_ROUND_SHARE, decimate
+from stages.editing.decimate import decimate
 from stages.editing.scene import EditedScene
 from stages.editing.syntax import OPERATIONS, ParsedOperation
 from stages.editing.transform import Similarity
@@ -173,22 +173,14 @@ def _refuse_rounded(
         )
 
 
-def decimate_scene(scene: EditedScene, count: int) -> Splats:
-    """At most `count` splats: by their contributions where training views are known, else by shape
-    and colour."""
-    if len(scene.training_views):
-        return decimate(scene.splats, count, FAR_ROUND_SHARE, scene.removal_costs)
-    return decimate(scene.splats, count, NEAR_ROUND_SHARE)
-
-
 def _decimating(parsed: ParsedOperation) -> Operation:
     if parsed.value.endswith("%"):
         part = _number(ParsedOperation(parsed.name, parsed.value[:-1]), 1e-6, 100) / 100
         return lambda scene: scene.with_splats(
-            decimate_scene(scene, round(part * len(scene.splats)))
+            decimate(scene.splats, round(part * len(scene.splats)))
         )
     count = int(_number(parsed, 1, 1e9, whole=True))
-    return lambda scene: scene.with_splats(decimate_scene(scene, count))
+    return lambda scene: scene.with_splats(decimate(scene.splats, count))
 
 
 def _limiting_size(max_bytes: float, target: Path) -> Operation:
@@ -213,9 +205,8 @@ def _limiting_size(max_bytes: float, target: Path) -> Operation:
                 return scene
             if count == 1:
                 break
-            scene = scene.with_splats(
-                decimate_scene(scene, int(_SAFETY * count * max_bytes / size))
-            )
+            fewer = int(_SAFETY * count * max_bytes / size)
+            scene = scene.with_splats(decimate(scene.splats, fewer))
         raise _too_small(max_bytes, size, count, row)
 
     return limited

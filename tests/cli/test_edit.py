@@ -129,7 +129,7 @@ def test_a_file_is_at_most_as_large_as_max_mb(source: Path, tmp_path: Path) -> N
 def test_a_size_that_one_splat_exceeds_is_refused_at_once(
     source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(operations, "decimate_scene", lambda *_: 1 / 0)
+    monkeypatch.setattr(operations, "decimate", lambda *_: 1 / 0)
     _, err = edited(source, tmp_path / "c.ply", "--max-mb", "0.0015", code=2)
     assert "less than 1 splat needs as .ply" in err
 

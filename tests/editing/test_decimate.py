@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stages.editing.decimate import Moments, RemovalCosts, decimate, merge
+from stages.editing.decimate import Moments, decimate, merge
 from stages.evaluate.image_metrics import capped_psnr_db
 from stages.raster.definition import ALPHA_MAX
 from stages.raster.draw import render
@@ -100,22 +100,3 @@ def test_colours_that_differ_are_merged_last() -> None:
     colours = 0.5 + 0.28209479 * found.sh[:, 0]
     pure = np.minimum(np.abs(colours - (1, 0, 0)).max(1), np.abs(colours - (0, 0, 1)).max(1))
     assert (pure < 1e-3).mean() > 0.9
-
-
-def test_splats_without_cost_are_removed_and_those_of_infinite_cost_stay() -> None:
-    splats = wall(400)
-    nothing = np.zeros(400, bool)
-    nothing[::8] = True
-    seen: list[int] = []
-
-    def removal_costs(now: Splats) -> RemovalCosts:
-        seen.append(len(now))
-        worthless = np.isclose(now.sh_degrees, 1)
-        return RemovalCosts(np.ones(len(now)), np.where(worthless, -1.0, np.inf))
-
-    marked = replace(splats, sh_degrees=nothing.astype(np.uint8))
-    found = decimate(marked, 380, 0.02, removal_costs)
-    assert len(found) == 380
-    assert seen[0] == 400
-    # with nothing else to leave out and merging at a price, the worthless went
-    assert found.sh_degrees.sum() == nothing.sum() - 20

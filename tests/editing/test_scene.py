@@ -71,18 +71,6 @@ def test_a_scene_that_is_moved_as_a_whole_costs_nothing(words: tuple[str, ...]) 
     np.testing.assert_allclose(drawn, render(start.splats, cameras()[1]).image, atol=0.01)
 
 
-def test_training_views_decide_what_is_removed() -> None:
-    solid = room()  # most of it hidden behind the rest
-    start = scene(replace(solid, opacity_logits=solid.opacity_logits + 3))
-    half = f"decimate {len(start.splats) // 2}"
-    guided = after(start, half)
-    blind = after(replace(start, training_views=(), held_out_views=()), half)
-    assert len(guided.splats) == len(blind.splats) == 750
-    assert blind.psnr_db() is None
-    judged = replace(blind, held_out_views=start.held_out_views)
-    assert (guided.psnr_db() or 0) > (judged.psnr_db() or 99) + 1
-
-
 def test_of_a_crop_the_share_of_the_pictures_is_told_and_no_psnr() -> None:
     splats = room()
     rng = np.random.default_rng(0)
