@@ -78,17 +78,20 @@ def view(
             count = len(splats)
             items = _items(target, pipeline, splats, Path(folder) / "scene.ply")
         del splats  # frees the memory: the page holds what it needs
-        try:
-            server = LocalServer(items, port)
-        except OSError as error:
-            raise UsageError(
-                "view-port",
-                given=f"Port {port} of this machine cannot be listened on: {error.strerror}.",
-                wanted="A port that is free and allowed.",
-                hint="Leave --port away to get a free one.",
-            ) from error
-        with server:
+        with _server(items, port) as server:
             _serve(server, count, open_browser)
+
+
+def _server(items: dict[str, Item], port: int) -> LocalServer:
+    try:
+        return LocalServer(items, port)
+    except OSError as error:
+        raise UsageError(
+            "view-port",
+            given=f"Port {port} of this machine cannot be listened on: {error.strerror}.",
+            wanted="A port that is free and allowed.",
+            hint="Leave --port away to get a free one.",
+        ) from error
 
 
 def _loaded(target: Path | None) -> tuple[Splats, Pipeline | None]:

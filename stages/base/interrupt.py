@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from types import FrameType
 
 
@@ -29,6 +29,16 @@ def handling(
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def stop_event(
+    given: threading.Event | None, on_stop: Callable[[], None]
+) -> Iterator[threading.Event]:
+    """Yield the given event, which its owner sets, or one that signals set: `stop_on_signals`."""
+    stop = given or threading.Event()
+    with nullcontext() if given else stop_on_signals(stop, on_stop):
+        yield stop
 
 
 @contextmanager

@@ -5,14 +5,13 @@ from __future__ import annotations
 import shlex
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
 from typing import Any
 
 from stages.base.errors import Family, Interrupted, RunFolderError, SplatError, UsageError
-from stages.base.interrupt import stop_on_signals
+from stages.base.interrupt import stop_event
 from stages.base.settings import check_settings
 from stages.base.stage import Stage
 from stages.run import runfolder
@@ -165,13 +164,12 @@ class Pipeline:
         for given in (settings or {}).values():
             check_settings(given)  # before a folder is made
         listener = listener or Listener()
-        handled: AbstractContextManager[None] = nullcontext()
-        if stop is None:
-            stop = Event()
-            handled = stop_on_signals(stop, listener.stopping)
         first = self.layout.workspace(self.layout.stages[0]).final
         try:
-            with runfolder.opened(self.run_folder, self.photos), handled:
+            with (
+                runfolder.opened(self.run_folder, self.photos),
+                stop_event(stop, listener.stopping) as stopped,
+            ):
                 for stage in self.layout.stages:
                     self.layout.workspace(stage).recover()
                 before = runfolder.recorded_for(self.run_folder, self.photos, first)
@@ -189,7 +187,7 @@ class Pipeline:
                         names = {stage.name for stage in later}
                         run_file.with_settings_from(before, names).write(self.run_folder)
 
-                return self._run_all(planner, until, stop, listener, forget)
+                return self._run_all(planner, until, stopped, listener, forget)
         except OSError as error:
             raise self._unusable(error) from error
         finally:

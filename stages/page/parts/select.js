@@ -237,7 +237,7 @@ class Selection {
         const step = Math.ceil(this.chosen.length / DOTS) || 1;
         for (let i = 0; i < this.chosen.length; i += step) {
             const at = seenBy(view, ...this.centres.subarray(this.chosen[i], this.chosen[i] + 3));
-            if (at) pen.fillRect(at[0], at[1], 1, 1);
+            if (at) pen.fillRect(at[0] - 1, at[1] - 1, 2, 2);
         }
         this.paintLines(pen, [...this.corners.map((to, i) => [this.corners.at(i - 1), to])]);
         if (find("tool").value === "box") this.paintLines(pen, this.edges(view));
