@@ -52,7 +52,6 @@ class Options(TypedDict, total=False):
     marker: float
     crs: str
     max_minutes: float
-    keep_outliers: bool
     fill: bool
     steps: int
     steps_per_view: int
@@ -77,7 +76,6 @@ class Options(TypedDict, total=False):
     finetune_steps: int
     sh_loss_db: float
     sog_loss_db: float
-    max_views: int
     formats: tuple[str, ...]
     plain_steps: int
     rounding_steps: int

@@ -47,7 +47,7 @@ def test_the_typed_options_are_the_fields_of_the_stages_settings() -> None:
         for s in STAGES
         for one in settings_of(s.settings_type)
     }
-    assert get_type_hints(Options) == {n: t for n, t in fields.items() if n != "device"}
+    assert get_type_hints(Options) == fields
 
 
 @pytest.mark.slow
