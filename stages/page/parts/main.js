@@ -81,8 +81,11 @@ function frameBy(act) {
 }
 
 async function checkGraphics() {
-    const canvas = document.createElement("canvas");
-    if (canvas.getContext("webgl2")) return;
+    const context = document.createElement("canvas").getContext("webgl2");
+    if (context) {
+        context.getExtension("WEBGL_lose_context")?.loseContext(); // a page may have few of them
+        return;
+    }
     if (navigator.gpu && (await navigator.gpu.requestAdapter())) return;
     throw new Error(
         "this browser has neither WebGL 2 nor WebGPU, or they are switched off. Switch on hardware "

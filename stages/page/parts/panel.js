@@ -4,6 +4,7 @@ const SMALL = "(pointer: coarse), (max-width: 700px)"; // as in page.css: a phon
 
 // What has the keys: a list takes all but Escape, a button those that press it.
 function takesKey(element, key) {
+    if (!(element instanceof Element)) return false;
     if (element.matches("select, input, textarea")) return key !== "Escape";
     return element.matches("button, summary, [role=button]") && (key === " " || key === "Enter");
 }
