@@ -19,9 +19,16 @@ from tests import processes
 BUNDLE = processes.ROOT / ".device"
 WHEELS = (
     *("pillow_heif", "flip_evaluator", "pygltflib", "plyfile", "dataclasses_json", "marshmallow<4"),
-    *("mypy_extensions", "typing_inspect", "fast_simplification", "zstandard", "typer", "gsplat"),
-    *("rich", "filelock", "shellingham"),
+    *(
+        "mypy_extensions",
+        "typing_inspect",
+        "fast_simplification",
+        "zstandard",
+        "gsplat",
+        "filelock",
+    ),
 )
+WHOLE = ("typer",)  # with all that it requires, in versions that fit each other
 STAGES = ("1-ingest", "2-sfm", "3-seed")
 MOST_BYTES = 64 * 2**20
 PLATFORMS = ("2_28", "2_27", "2_26", "2_24", "2_17", "2_12", "2_5")
@@ -32,17 +39,9 @@ def wheels(folder: Path) -> None:
     shutil.rmtree(folder, ignore_errors=True)
     older = ("manylinux2014", "manylinux2010", "manylinux1")
     names = [f"manylinux_{n}_x86_64" for n in PLATFORMS] + [f"{n}_x86_64" for n in older]
-    for name in WHEELS:
-        words = [
-            "-m",
-            "pip",
-            "download",
-            "-q",
-            "--no-deps",
-            "--only-binary=:all:",
-            "-d",
-            str(folder),
-        ]
+    for name in (*WHEELS, *WHOLE):
+        words = ["-m", "pip", "download", "-q", "--only-binary=:all:", "-d", str(folder)]
+        words += [] if name in WHOLE else ["--no-deps"]
         words += ["--python-version", "3.12", "--implementation", "cp", "--abi", "cp312"]
         words += ["--abi", "abi3", "--abi", "none"]
         words += [word for platform in names for word in ("--platform", platform)]
