@@ -12,7 +12,7 @@ import triton.language as tl
 
 from stages.raster import definition
 from stages.raster.gpu.geometry import ALPHA_MAX, ALPHA_MIN
-from stages.raster.gpu.inner import inner, sum_of, top_of
+from stages.raster.gpu.inner import fused, inner, sum_of, top_of
 from stages.raster.gpu.project import (
     COLOUR,
     CUT_HI,
@@ -86,7 +86,7 @@ def inverse_of(x):
     rounded takes five times the instructions of this root and a step of Newton's method."""
     root = tl.rsqrt(x)
     y = root * root
-    return tl.fma(y, tl.fma(-x, y, 1.0), y)
+    return fused(y, fused(-x, y, 1.0), y)
 
 
 @triton.jit(do_not_specialize=SIZES)

@@ -32,6 +32,10 @@ if INTERPRETED:
         """Maximum along an axis."""
         return tl.reduce(x, axis, tl.standard._elementwise_max)
 
+    def fused(x: Any, y: Any, z: Any) -> Any:
+        """x y + z, rounded once, as devices do it; the interpreter's own rounds twice."""
+        return (x.to(tl.float64) * y.to(tl.float64) + z).to(tl.float32)
+
 else:
 
     @triton.jit
@@ -41,6 +45,10 @@ else:
     @triton.jit
     def top_of(x, axis: tl.constexpr):
         return tl.max(x, axis)
+
+    @triton.jit
+    def fused(x, y, z):
+        return tl.fma(x, y, z)
 
 
 @triton.jit
