@@ -92,7 +92,8 @@ def _refuse_nothing(source: Path, target: Path, splats: Splats, dropped: int) ->
 def _show(facts: dict[str, Any], found: dict[str, Any]) -> None:
     size = f"{facts['splats']:,} splats, {console.size(facts['size_bytes'])}"
     quality = console.fidelity(found["verify_db"])
-    seen = ", no difference is seen" if console.EXACT_DB > found["verify_db"] >= _UNSEEN_DB else ""
+    alike = not facts["warnings"] and console.EXACT_DB > found["verify_db"] >= _UNSEEN_DB
+    seen = ", no difference is seen" if alike else ""
     each = f"{facts['bytes_per_splat']:.1f} bytes each"
     console.note(f"{facts['target']}: {size}, {each}, {quality}{seen}")
     worst = {name: found[name] for name in found if name.startswith("max_") and found[name] > 0}

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from stages.base import scratch
 from stages.base.row_slices import row_slices
@@ -27,7 +27,6 @@ _MAX_MISMATCHED = 0.05  # share of the rows; an order with more rows of unlike v
 _DISTANCE_WEIGHT = 20.0
 _NEIGHBOURS = 8
 _ROUNDS = 8
-_KDTREE_SINGLE = 4  # OpenCV's name for the exact tree for few dimensions
 
 
 @dataclass(frozen=True)
@@ -119,18 +118,14 @@ def _match_neighbours(
         if len(mine) < 2 or len(np.unique(truth.means[theirs, 0])) * 100 < len(theirs):
             break
         count = min(_NEIGHBOURS, len(theirs))
-        tree = cv2.flann.Index(
-            np.ascontiguousarray(truth.means[theirs], np.float32),
-            {"algorithm": _KDTREE_SINGLE, "leaf_max_size": 10},
-        )
-        queries = np.ascontiguousarray(file.means[mine], np.float32)
-        places, squares = tree.knnSearch(queries, count, params={"checks": -1})
+        tree = cKDTree(truth.means[theirs].astype(np.float64))
+        distances, places = tree.query(file.means[mine].astype(np.float64), count)
         choice = np.arange(len(mine))
         unlike = np.square(truth.values[theirs] - file.values[mine]).sum(axis=1)
         cost = np.where(moved, unlike + 1, np.inf)
-        for place, square in zip(places.T, squares.T, strict=True):
+        for place, distance in zip(places.T, distances.T, strict=True):
             unlike = np.square(truth.values[theirs[place]] - file.values[mine]).sum(axis=1)
-            total = square.astype(np.float64) / unit**2 + unlike
+            total = np.square(distance / unit) + unlike
             better = total < cost
             cost[better], choice[better] = total[better], place[better]
         by_cost = np.argsort(cost, kind="stable")

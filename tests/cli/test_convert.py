@@ -129,6 +129,18 @@ def test_splats_that_cannot_be_drawn_are_counted(tmp_path: Path) -> None:
     assert "4 splats" in err
 
 
+@pytest.mark.parametrize("ending", ["compressed.ply", "spz", "sog", "splat"])
+def test_splats_as_far_as_32_bits_reach_are_compared(tmp_path: Path, ending: str) -> None:
+    splats = replace(many_splats(300), origin=np.zeros(3))
+    splats.means[5:7] = np.array([[3e38], [-3e38]])
+    formats.write(tmp_path / "a.ply", splats)
+    result = CliRunner().invoke(
+        app, ["convert", *(str(tmp_path / f"{n}") for n in ("a.ply", f"b.{ending}"))]
+    )
+    assert result.exit_code in (0, 7)
+    assert "Unexpected" not in result.stderr
+
+
 def test_splats_out_of_range_are_counted_and_reported(tmp_path: Path) -> None:
     splats = replace(many_splats(2000), origin=np.zeros(3))
     splats.means[4] = 1e6
