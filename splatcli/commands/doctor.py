@@ -124,7 +124,8 @@ def _kernel_cache() -> str:
 def _gpu() -> str:
     """The GPU, also if torch cannot use it."""
     missing = device.missing()
-    return f"{missing}; {device.built()}" if missing else device.describe()
+    ready = f"{device.describe()}; its kernels compile in the first run"
+    return f"{missing}; {device.built()}" if missing else ready
 
 
 def _meaning() -> str:
