@@ -104,7 +104,7 @@ class _BlockTraining:
         if not light:
             views = tuple(replace(view, light=None) for view in self.whole.views)
             self.whole = replace(self.whole, views=views)
-        one_choice = "on" if light else "auto" if vignetting else "off"
+        one_choice = "auto" if light or vignetting else "off"
         self.settings = replace(self.settings, light=one_choice)
         coarse = self._coarse(seeds, max(blocks, COARSE_SPLATS))
         training, held = split_held_out(self.whole.views)

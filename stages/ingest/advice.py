@@ -19,7 +19,6 @@ FEWEST_WITHOUT_WARNING, FEWEST_PANORAMAS = 20, 12
 BLURRED_BELOW = 0.6  # of the capture's median; a blur of 1.5 px at 1600 px gives about 0.55
 SOFT_BELOW = 2.5  # median sharpness; of pictures enlarged four times or blurred by 3 px it is less
 EV_RANGE_STOPS = 1.0
-LUMINANCE_RANGE_STOPS = 2.0  # without Exif; the subject changes brightness, too
 DARK_BELOW = -6.5  # log2 of linear luminance: about 30 of 255
 SMALL_BELOW_PX = 640
 _NAMED = 8
@@ -93,9 +92,7 @@ def about_left_out(code: str, unusable: Sequence[tuple[str, str, str]], warn: Wa
         warn(code, f"Also {others}: {listed(rest)}.")
 
 
-def about_capture(
-    photos: Sequence[Photo], duplicates: Sequence[tuple[int, ...]], warn: Warn
-) -> list[str]:
+def about_capture(photos: Sequence[Photo], warn: Warn) -> list[str]:
     """Warns about the capture as a whole; returns the names of blurred photographs."""
     panoramas = sum(photo.face is not None for photo in photos)
     if len(photos) < FEWEST_WITHOUT_WARNING and panoramas < FEWEST_PANORAMAS:
@@ -127,37 +124,18 @@ def about_capture(
     )
     _about_light(photos, warn)
     _about_cameras(photos, warn)
-    if duplicates:
-        groups = "; ".join(listed([photos[i].name for i in group]) for group in duplicates[:_NAMED])
-        extra = sum(len(group) - 1 for group in duplicates)
-        warn(
-            "ingest-near-duplicates",
-            f"{extra} of {len(photos)} photographs {'shows' if extra == 1 else 'show'} nearly the "
-            f"same as another: {groups}. "
-            "They add no depth: take a step sideways between photographs.",
-        )
     return blurred
 
 
 def _about_light(photos: Sequence[Photo], warn: Warn) -> None:
     known = [photo.exposure_ev for photo in photos if photo.exposure_ev is not None]
-    luminance = [photo.log2_luminance for photo in photos]
-    advice = (
-        "Lock exposure and white balance before the first photograph; "
-        "otherwise the scene gets patches of different brightness."
-    )
     if len(known) > 1 and max(known) - min(known) > EV_RANGE_STOPS:
         warn(
             "ingest-exposure-not-locked",
-            f"The camera changed its exposure by {max(known) - min(known):.1f} stops. {advice}",
+            f"The camera changed its exposure by {max(known) - min(known):.1f} stops. Lock "
+            "exposure and white balance before the first photograph; otherwise the scene gets "
+            "patches of different brightness.",
         )
-    elif len(known) < len(photos):
-        low, high = np.percentile(luminance, [5, 95])
-        if high - low > LUMINANCE_RANGE_STOPS:
-            warn(
-                "ingest-brightness-varies",
-                f"Brightness differs by {high - low:.1f} stops between photographs. {advice}",
-            )
 
 
 def _about_cameras(photos: Sequence[Photo], warn: Warn) -> None:

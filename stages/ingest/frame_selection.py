@@ -16,6 +16,8 @@ MEASURED_SIDE_PX = 800
 _FLOW_SIDE_PX = 320
 _CELLS = (6, 4)  # grid over the picture; the motion of each cell is kept for each frame
 STEP = 0.05  # of the longer side, from one chosen frame to the next
+FEWEST_FRAMES = 24  # of one video that moves little, as far as they differ by LEAST_STEP
+LEAST_STEP = 0.015  # of the longer side
 MAX_FRAMES = 300  # of one video, unless a number is given
 _SHAKE = 0.01  # of the longer side: motion to and fro within it is camera shake
 MAX_GAP = 0.25  # of the longer side; a blurred frame is better than a wider gap
@@ -74,11 +76,13 @@ class FrameMeter:
 
 
 def select_frames(measured: Sequence[MeasuredFrame], wanted: int) -> list[SelectedFrame]:
-    """Frames in order of time, at most `wanted`; with 0, one for each `STEP` of motion."""
+    """Frames in order of time, at most `wanted`. With 0, one for each `STEP` of motion; a video
+    that moves little gives `FEWEST_FRAMES`, as far as they are `LEAST_STEP` apart."""
     path = travelled(np.array([one.motion for one in measured]))
     sharp = relative_sharpness(np.array([one.sharpness for one in measured]))
     if not wanted:
-        wanted = int(np.clip(round(path[-1] / STEP), 3, MAX_FRAMES))
+        fewest = min(FEWEST_FRAMES, int(path[-1] / LEAST_STEP))
+        wanted = int(np.clip(max(round(path[-1] / STEP), fewest), 3, MAX_FRAMES))
         numbers = _one_per_stretch(path, sharp, wanted)
     else:
         # Stretches without a sharp frame give none: try more of them until there are enough frames.

@@ -121,7 +121,8 @@ def run(
     first = {usable[i].name: usable[group[0]].name for group in duplicates for i in group}
     photos = (photo for one in usable for photo in one.photos)
     photos = (replace(photo, duplicate_of=first.get(photo.source, "")) for photo in photos)
-    _report_capture(pictures, duplicates, report)
+    _report_capture(pictures, report)
+    report.metric("near_duplicates", sum(len(group) - 1 for group in duplicates))
     report.metric("left_out", len(unusable))
     report.metric("files_ignored", found.others)
     capture = Capture(folder, tuple(photos))
@@ -296,11 +297,8 @@ def _camera_key(picture: _Picture, masked: MaskedPhoto) -> str:
     return masked.decoded.exif.camera_key(width, height)
 
 
-def _report_capture(
-    photos: tuple[Photo, ...], duplicates: list[tuple[int, ...]], report: Report
-) -> None:
-
-    blurred = advice.about_capture(photos, duplicates, report.warn)
+def _report_capture(photos: tuple[Photo, ...], report: Report) -> None:
+    blurred = advice.about_capture(photos, report.warn)
     report.metric("photographs", len(photos))
     report.metric("panoramas", sum(photo.face is not None for photo in photos))
     report.metric("with_focal_length", sum(photo.focal_px is not None for photo in photos))
@@ -309,4 +307,3 @@ def _report_capture(
         report.metric("with_depth", sum(bool(photo.depth) for photo in photos))
     report.metric("cameras", len({photo.camera for photo in photos}))
     report.metric("blurred", len(blurred))
-    report.metric("near_duplicates", sum(len(group) - 1 for group in duplicates))

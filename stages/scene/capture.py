@@ -163,8 +163,6 @@ class Reconstruction:
         units: "metres", or "arbitrary" if the scale of the scene is unknown.
         place: where the world is on the earth; None if that is unknown.
         levelled: whether the up direction (-Y) was found from the cameras.
-        light_explained: how much of the variance of a point's values over its views disappears when
-            the lights of the views are corrected: 0 to 1.
     """
 
     folder: Path
@@ -177,7 +175,6 @@ class Reconstruction:
     units: str = "arbitrary"
     place: EarthPlace | None = None
     levelled: bool = False
-    light_explained: float = 0.0
 
     def __repr__(self) -> str:
         return f"Reconstruction({len(self.views)} views, {len(self.points):,} points)"

@@ -19,7 +19,6 @@ from stages.scene.camera import Camera
 OFFSET, POWER = 0.055, 2.4  # of sRGB: light is ((value + OFFSET) / (1 + OFFSET)) ** POWER
 BRIGHT = 253 / 255  # from here on a value may be clipped
 NOISE_EV = 0.05  # variation of one camera with fixed settings
-LEAST_EXPLAINED = 0.5  # of the variance of points over their views
 Light = tuple[float, float, float]  # EV above the median photograph: red, green, blue
 Vignetting = tuple[float, float, float]  # EV: k1, k2, k3
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -20,9 +20,9 @@ from scipy.ndimage import median
 from scipy.sparse import csr_array, hstack
 
 from stages.base.stage import Report
-from stages.cameras.colmap import read_model
+from stages.cameras.colmap import Observations, read_model
 from stages.scene import Camera, Reconstruction
-from stages.scene.light import OFFSET, POWER, powers_of_radius, spread_ev
+from stages.scene.light import NOISE_EV, OFFSET, POWER, powers_of_radius
 from stages.sfm.finish import SPARSE
 
 DOWNSCALE = 4  # of the pictures' sides; averages out their noise
@@ -33,49 +33,76 @@ ITERATIONS = 8  # of reweighted least squares
 FEWEST_VIEWS = 4  # of a camera whose vignetting is measured
 LEAST_CORNER_EV = 0.15  # of vignetting
 LEAST_AGREEMENT = 0.75  # of vignetting fitted to one side of the picture, x that of all sides
+LEAST_VIGNETTING_EXPLAINED = 0.01  # of the variance of points that exposure leaves
+LEAST_EXPLAINED = 0.5  # of the variance of a point's values over its views
+
+
+@dataclass(frozen=True)
+class Change:
+    """Exposure or white balance, as far as photographs differ in it.
+
+    Args:
+        spread_ev: root mean square over photographs, EV.
+        explained: how much of the variance of a point's values over its views disappears when this
+            is corrected: 1 for all of it. Low for surfaces that shine. Variance is measured by
+            median absolute deviations.
+        disagreement_ev: root mean square, over photographs and the octants of the scene around its
+            median point, by which an octant differs from the whole. A camera that changes its
+            exposure changes all parts of a picture; a lamp on a turning object does not.
+    """
+
+    spread_ev: float = 0.0
+    explained: float = 0.0
+    disagreement_ev: float = 0.0
+
+    @property
+    def supported(self) -> bool:
+        """Whether the camera changed, and not what it shows."""
+        enough = self.explained >= LEAST_EXPLAINED and self.spread_ev > NOISE_EV
+        return enough and self.disagreement_ev < self.spread_ev
 
 
 @dataclass(frozen=True)
 class MeasuredLight:
-    """What `measure_light` measures, in EV.
+    """What `measure_light` measures.
 
     Args:
-        light: [V, 3] by how much each photograph is lighter than the median one in red, green and
-            blue; NaN for a view with too few usable points.
-        explained: how much of the variance of a point's values over its views disappears when they
-            are corrected by `light`: 1 for all of it. Low for surfaces that shine. Variance is
-            measured by median absolute deviations.
-        vignetting: [V, 3] of the camera of each view (`scene.light`); 0 where none was found.
-        vignetting_explained: how much of the variance that is left then disappears when vignetting
-            is corrected, too.
+        light: [V, 3] by how many EV each photograph is lighter than the median one in red, green
+            and blue, as far as `exposure` and `white_balance` are supported; NaN for a view with
+            too few usable points.
+        exposure: the mean over the channels.
+        white_balance: the channels' differences from their mean.
+        vignetting: [V, 3] of the camera of each view, EV (`scene.light`); 0 where none was found.
+        vignetting_explained: how much of the variance that light leaves disappears when vignetting
+            is corrected.
     """
 
     light: NDArray[np.float64]
-    explained: float
+    exposure: Change
+    white_balance: Change
     vignetting: NDArray[np.float64]
     vignetting_explained: float = 0.0
 
 
 def with_light(reconstruction: Reconstruction, report: Report) -> Reconstruction:
     """The reconstruction with `View.light` and `View.vignetting`, measured at the points of its
-    COLMAP model, and the share of the points' scatter that the light explains. Training decides
-    whether they are corrected."""
-    _, _, observed = read_model(reconstruction.folder / SPARSE)
+    COLMAP model."""
+    _, cloud, observed = read_model(reconstruction.folder / SPARSE)
     pictures = [reconstruction.folder / view.image for view in reconstruction.views]
     found = measure_light(
         pictures,
         [view.camera for view in reconstruction.views],
-        observed.points,
-        observed.views,
-        observed.px,
+        cloud.points,
+        observed,
         tick=lambda done: report.progress(done, len(pictures), "measuring light"),
     )
     lights = [
         None if math.isnan(red) else (red, green, blue)
         for red, green, blue in found.light.round(4).tolist()
     ]
-    report.metric("light_spread_ev", round(spread_ev(lights), 4))
-    report.metric("light_explained", round(found.explained, 4))
+    for name in ("exposure", "white_balance"):
+        change = {key: round(value, 4) for key, value in asdict(getattr(found, name)).items()}
+        report.metric(name, change | {"supported": getattr(found, name).supported})
     report.metric("vignetting_ev", round(float(found.vignetting.sum(axis=1).max()), 4))
     report.metric("vignetting_explained", round(found.vignetting_explained, 4))
     views = (
@@ -84,16 +111,14 @@ def with_light(reconstruction: Reconstruction, report: Report) -> Reconstruction
             reconstruction.views, lights, found.vignetting.round(4).tolist(), strict=True
         )
     )
-    explained = round(found.explained, 4)
-    return replace(reconstruction, views=tuple(views), light_explained=explained)
+    return replace(reconstruction, views=tuple(views))
 
 
 def measure_light(
     pictures: Sequence[Path],
     cameras: Sequence[Camera],
-    points: NDArray[np.int32],
-    views: NDArray[np.int32],
-    px: NDArray[np.float64],
+    positions: NDArray[np.float64],
+    observed: Observations,
     tick: Callable[[int], None] = lambda done: None,
 ) -> MeasuredLight:
     """Exposure, white balance and vignetting.
@@ -101,34 +126,73 @@ def measure_light(
     Args:
         pictures: [V] files.
         cameras: [V] of them; those with the same intrinsics have the same vignetting.
-        points, views, px: [O], [O], [O, 2] observations, in pixels of the picture.
+        positions: [P, 3] of the points.
+        observed: which of them are seen where.
         tick: called after each picture, with how many are done.
     """
+    points, views, px = observed.points, observed.views, observed.px
     values = _values(pictures, views, px, tick)
     usable = ((values > DARKEST) & (values < LIGHTEST)).all(axis=1)
     counts = np.bincount(views[usable], minlength=len(pictures))
     usable &= counts[views] >= FEWEST_POINTS
-    light, vignetting = np.full((len(pictures), 3), np.nan), np.zeros((len(pictures), 3))
+    vignetting = np.zeros((len(pictures), 3))
     if not usable.any():
-        return MeasuredLight(light, 0.0, vignetting)
+        return MeasuredLight(np.full(vignetting.shape, np.nan), Change(), Change(), vignetting)
     points, views, values, px = points[usable], views[usable], values[usable], px[usable]
-    ev = POWER * np.log2(values.astype(np.float64) + OFFSET)
+    taken = POWER * np.log2(values.astype(np.float64) + OFFSET)
     place = np.array([(c.cx, c.cy, math.hypot(c.width, c.height) / 2) for c in cameras])[views]
     place = (px - place[:, :2]) / place[:, 2:]
-    vignetting = _vignetting(points, views, ev.mean(axis=1), place, _numbers_of_cameras(cameras))
-    darker = (powers_of_radius((place**2).sum(axis=1)) * vignetting[views]).sum(axis=1)
-    vignetted, ev = ev, ev + darker[:, None]
-    seen, shown = np.unique(views), _indicators(views, len(pictures))
-    offsets = np.array([_solution(points, channel, shown) for channel in ev.T]).T
-    light[seen] = offsets[seen] - np.median(offsets[seen], axis=0)
-    before, after = _variance(points, ev), _variance(points, ev - light[views])
-    uncorrected = _variance(points, vignetted - light[views])
-    return MeasuredLight(
-        light,
-        1.0 - after / before if before else 0.0,
-        vignetting,
-        1.0 - after / uncorrected if uncorrected else 0.0,
-    )
+    vignetting = _vignetting(points, views, taken.mean(axis=1), place, _numbers_of_cameras(cameras))
+    darker = (powers_of_radius((place**2).sum(axis=1)) * vignetting[views]).sum(axis=1)[:, None]
+    light = _offsets(points, views, taken + darker, len(pictures))[views]
+    left, without = (_variance(points, ev - light) for ev in (taken + darker, taken))
+    explained = 1.0 - left / without if without else 0.0
+    if explained < LEAST_VIGNETTING_EXPLAINED:
+        vignetting, darker, explained = np.zeros_like(vignetting), np.zeros_like(darker), 0.0
+    ev = taken + darker
+    grey = ev.mean(axis=1, keepdims=True)
+    octants = (positions > np.median(positions, axis=0))[points] @ np.array([1, 2, 4])
+    exposure, lighter = _change(points, views, grey, octants, len(pictures))
+    white_balance, tinted = _change(points, views, ev - grey, octants, len(pictures))
+    light = exposure.supported * lighter + white_balance.supported * tinted
+    return MeasuredLight(light, exposure, white_balance, vignetting, explained)
+
+
+def _change(
+    points: NDArray[np.int32],
+    views: NDArray[np.int32],
+    ev: NDArray[np.float64],
+    octants: NDArray[np.intp],
+    count: int,
+) -> tuple[Change, NDArray[np.float64]]:
+    """How photographs differ in `ev` [O, C], and by how much each does [count, C], which is NaN
+    where too few points are seen. octants [O]: of the observed points."""
+    offsets = _offsets(points, views, ev, count)
+    apart = []
+    for octant in range(8):
+        here = octants == octant
+        if here.any():
+            apart.append(_offsets(points[here], views[here], ev[here], count) - offsets)
+    differs = np.any(np.abs(offsets) > NOISE_EV, axis=1)[views]
+    before, after = _variance(points, ev, differs), _variance(points, ev - offsets[views], differs)
+    explained = 1.0 - after / before if before else 0.0
+    return Change(_rms(offsets), explained, _rms(np.array(apart))), offsets
+
+
+def _rms(values: NDArray[np.float64]) -> float:
+    """Root mean square of those that are known; 0 if none is."""
+    known = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(known**2))) if known.size else 0.0
+
+
+def _offsets(
+    points: NDArray[np.int32], views: NDArray[np.int32], ev: NDArray[np.float64], count: int
+) -> NDArray[np.float64]:
+    """[count, C] by how much each photograph is lighter than the median one; NaN where it shows
+    fewer than `FEWEST_POINTS`. ev: [O, C]."""
+    found = np.array([_solution(points, channel, _indicators(views, count)) for channel in ev.T]).T
+    found[np.bincount(views, minlength=count) < FEWEST_POINTS] = np.nan
+    return found - np.nanmedian(found, axis=0) if np.isfinite(found).any() else found
 
 
 def _numbers_of_cameras(cameras: Sequence[Camera]) -> NDArray[np.intp]:
@@ -177,12 +241,15 @@ def _indicators(views: NDArray[np.int32], count: int) -> csr_array:
     return csr_array((np.ones(len(views)), (np.arange(len(views)), views)), (len(views), count))
 
 
-def _variance(points: NDArray[np.int32], ev: NDArray[np.float64]) -> float:
-    """Sum over channels of the squared median absolute deviation of `ev` [O, 3] from the median of
-    each point."""
+def _variance(
+    points: NDArray[np.int32], ev: NDArray[np.float64], where: NDArray[np.bool_] | None = None
+) -> float:
+    """Sum over channels of the squared median absolute deviation of `ev` [O, C] from the median of
+    each point. where: [O] the deviations that count; None for all."""
     ids, point = np.unique(points, return_inverse=True)
     middle = np.stack([median(channel, point, np.arange(len(ids)))[point] for channel in ev.T], 1)
-    return float((np.median(np.abs(ev - middle), axis=0) ** 2).sum())
+    away = np.abs(ev - middle)[slice(None) if where is None else where]
+    return float((np.median(away, axis=0) ** 2).sum()) if len(away) else 0.0
 
 
 def _values(

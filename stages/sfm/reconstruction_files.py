@@ -31,7 +31,6 @@ def save_reconstruction(folder: Path, reconstruction: Reconstruction) -> None:
         "levelled": reconstruction.levelled,
         "origin": [float(value) for value in reconstruction.origin],
         **({} if reconstruction.place is None else {"place": reconstruction.place.to_json()}),
-        "light_explained": float(reconstruction.light_explained),
         "points": len(reconstruction.points),
         "views": [_view_to_dict(view) for view in reconstruction.views],
     }
@@ -57,7 +56,6 @@ def load_reconstruction(folder: Path) -> Reconstruction:
             units=str(data["units"]),
             place=EarthPlace.from_json(data["place"]) if "place" in data else None,
             levelled=bool(data["levelled"]),
-            light_explained=float(data.get("light_explained", 0.0)),
             **arrays,
         )
 

@@ -17,7 +17,7 @@ from typing import Any
 from stages.base.atomic import replacing
 from stages.base.errors import ReconstructionError
 from stages.base.stage import Report
-from stages.base.text import counted
+from stages.base.text import counted, listed
 from stages.scene import Capture, Reconstruction
 from stages.sfm import finish, light, reconstruction_files
 from stages.sfm.checks import acceptance, attempt_runner, fallbacks
@@ -82,7 +82,7 @@ def _from_photographs(
     report: Report,
 ) -> tuple[Reconstruction, dict[str, float]]:
     """(the reconstruction, seconds by step)."""
-    _check_duplicates(capture)
+    check_duplicates(capture, report)
     features = usable_features(settings.features, report)
     work = folder / _WORK
     project, sift = project_of(capture, work, settings.seed), Sift(settings.max_features)
@@ -128,9 +128,12 @@ def load(folder: Path) -> Reconstruction:
     return load_reconstruction(folder)
 
 
-def _check_duplicates(capture: Capture) -> None:
-    """Refuse a capture of near-duplicates at once; matching would take minutes to find the same."""
-    different = len({photo.duplicate_of or photo.source for photo in capture.photos})
+def check_duplicates(capture: Capture, report: Report) -> None:
+    """Refuse a capture of near-duplicates at once; matching would take minutes to find the same.
+    Warns if some of the photographs are."""
+    sources = {photo.source: photo.duplicate_of for photo in capture.photos}
+    alike = [(name, first) for name, first in sources.items() if first not in ("", name)]
+    different = len(sources) - len(alike)
     if different < _FEWEST_PHOTOGRAPHS:
         raise ReconstructionError(
             "sfm-no-parallax",
@@ -139,6 +142,14 @@ def _check_duplicates(capture: Capture) -> None:
             "the same as another.",
             wanted="Depth can be measured only when the camera moves sideways.",
             hint=MOVE,
+        )
+    if alike:
+        shown = "shows" if len(alike) == 1 else "show"
+        named = listed([f"{name} (as {first})" for name, first in alike])
+        report.warn(
+            "sfm-near-duplicates",
+            f"{len(alike)} of {len(sources)} photographs {shown} nearly the same as another: "
+            f"{named}. They add no depth: take a step sideways between photographs.",
         )
 
 

@@ -10,7 +10,7 @@ from stages.base.text import counted
 from stages.evaluate.evaluation import load_evaluation_views
 from stages.raster.backends import backend_of
 from stages.scene import Reconstruction, draw_settings_of, split_held_out, training_extent
-from stages.scene.light import LEAST_EXPLAINED, NOISE_EV, spread_ev
+from stages.scene.light import spread_ev
 from stages.train.camera_refinement import CameraRefinement
 from stages.train.cap import cap_for, splats_determined
 from stages.train.schedule import Schedule
@@ -109,7 +109,7 @@ def _on_the_host(backend: str, report: Report) -> str:
 
 
 def corrects_vignetting(reconstruction: Reconstruction, choice: str, report: Report) -> bool:
-    """Whether the vignetting of the views is corrected; arguments as in `corrects_light`.
+    """Whether the vignetting of the views is corrected; choice as in `corrects_light`.
 
     Structure from motion measures it, and stores only what differs from a scene's shading."""
     corrects = choice != "off" and any(view.vignetting for view in reconstruction.views)
@@ -118,43 +118,16 @@ def corrects_vignetting(reconstruction: Reconstruction, choice: str, report: Rep
 
 
 def corrects_light(reconstruction: Reconstruction, choice: str, report: Report) -> bool:
-    """Whether the views are brought to their median exposure and white balance.
-
-    "auto" does so if the light differs by more than a camera's noise and explains most of what
-    points differ by between views: otherwise surfaces shine, and a correction costs quality.
-
-    Args:
-        reconstruction: with the light of its views.
-        choice: "auto", "on" or "off", see `TrainSettings.light`.
-        report: receives metrics, and a warning if "auto" finds a difference, or "on" no light.
-    """
-    lights = [view.light for view in reconstruction.views]
-    known = any(light is not None for light in lights)
-    spread, explained = spread_ev(lights), reconstruction.light_explained
-    differs = spread > NOISE_EV
-    corrects = choice == "on" or (choice == "auto" and differs and explained >= LEAST_EXPLAINED)
+    """Whether the views are brought to their median exposure and white balance: if structure from
+    motion found that the camera changed these, unless the `choice` is "off"."""
+    spread = spread_ev(view.light for view in reconstruction.views)
+    corrects = choice != "off" and spread > 0
     report.metric("light_spread_ev", round(spread, 4))
-    report.metric("light_corrected", corrects and known)
-    if choice == "on" and not known:
-        report.warn(
-            "train-light-unknown",
-            "--light on changes nothing: photographs share too few usable points to measure their "
-            "exposure and white balance.",
-        )
-    if choice != "auto" or not differs:
-        return corrects
+    report.metric("light_corrected", corrects)
     if corrects:
         report.warn(
             "train-light-evened",
             f"Exposure or white balance differ between photographs (typically by {spread:.2f} EV): "
-            "they are brought to the median photograph's. Lock both in the camera to lose nothing.",
-        )
-    else:
-        report.warn(
-            "train-light-not-evened",
-            f"Light differs between photographs (typically by {spread:.2f} EV) and is left as it "
-            f"is: it explains only {max(0.0, explained):.0%} of what points differ by between "
-            "photographs, which shiny surfaces cause, too. If the camera changed its exposure or "
-            "white balance, use --light on.",
+            "they are brought to the median photograph's.",
         )
     return corrects

@@ -66,11 +66,10 @@ class TrainSettings:
     )
     light: str = setting(
         "auto",
-        "Bring all photographs to the median exposure and white balance before "
-        "training: auto (if they differ by more than a camera's noise and points agree), on or "
-        "off. Vignetting that points agree about is corrected unless this is off.",
+        "Bring all photographs to the median exposure and white balance, and correct vignetting, "
+        "before training: auto (what the points of all parts of the scene agree about) or off.",
         panel="Light and masks",
-        choices=("auto", "on", "off"),
+        choices=("auto", "off"),
     )
     refine_in_training: bool = setting(
         False,
@@ -111,7 +110,7 @@ PRESETS: dict[str, TrainSettings] = {
 
 STAGE = Stage(
     "train",
-    version=31,
+    version=32,
     reads=("sfm", "seed"),
     settings_type=TrainSettings,
     **in_module("stages.train.stage"),

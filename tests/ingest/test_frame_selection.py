@@ -6,6 +6,8 @@ import numpy as np
 
 from stages.ingest.frame_selection import (
     BLURRED_BELOW,
+    FEWEST_FRAMES,
+    LEAST_STEP,
     MAX_GAP,
     STEP,
     FrameMeter,
@@ -39,6 +41,14 @@ def test_frames_come_as_the_picture_moves_not_as_time_goes():
     gaps = [one.moved for one in found[1:]]
     assert max(gaps) < 2 * STEP
     assert min(gaps) > 0.3 * STEP
+
+
+def test_a_short_film_gives_as_many_frames_as_an_object_needs_if_they_differ():
+    short = select_frames(walk(np.full(117, 0.4 / 117)), 0)
+    assert FEWEST_FRAMES - 1 <= len(short) <= FEWEST_FRAMES
+    assert min(one.moved for one in short[1:]) > 0.5 * LEAST_STEP
+    still = select_frames(walk(np.full(117, 0.1 / 117)), 0)
+    assert len(still) <= 0.1 / LEAST_STEP + 1
 
 
 def test_a_hand_that_trembles_on_the_spot_gets_nowhere():

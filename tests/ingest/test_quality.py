@@ -29,9 +29,9 @@ def photo(number: int = 0, **changes: Any) -> Photo:
     return Photo(**{**values, **changes})
 
 
-def codes(photos: list[Photo], duplicates: list[tuple[int, ...]] | None = None) -> dict[str, str]:
+def codes(photos: list[Photo]) -> dict[str, str]:
     warnings: dict[str, str] = {}
-    about_capture(photos, duplicates or [], warnings.__setitem__)
+    about_capture(photos, warnings.__setitem__)
     return warnings
 
 
@@ -101,19 +101,17 @@ def test_half_a_stop_is_no_change_of_exposure() -> None:
     assert codes([*MANY, photo(99, exposure_ev=10.5)]) == {}
 
 
-def test_brightness_stands_in_where_exif_is_missing() -> None:
+def test_the_brightness_of_what_photographs_show_is_no_change_of_exposure() -> None:
     photos = [photo(i, exposure_ev=None, log2_luminance=-2.0 - 0.15 * i) for i in range(24)]
-    assert set(codes(photos)) == {"ingest-brightness-varies"}
+    assert codes(photos) == {}
 
 
 def test_a_capture_that_is_soft_all_over_is_reported() -> None:
     assert set(codes([photo(i, sharpness=2.0) for i in range(24)])) == {"ingest-soft"}
 
 
-def test_too_few_and_near_duplicates_are_reported() -> None:
-    warnings = codes([photo(i) for i in range(5)], [(0, 2, 3)])
-    assert set(warnings) == {"ingest-few-photographs", "ingest-near-duplicates"}
-    assert "2 of 5" in warnings["ingest-near-duplicates"]
+def test_too_few_are_reported() -> None:
+    assert set(codes([photo(i) for i in range(5)])) == {"ingest-few-photographs"}
 
 
 def test_twelve_panoramas_are_enough_for_a_room() -> None:

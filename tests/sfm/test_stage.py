@@ -195,6 +195,20 @@ def test_near_duplicates_are_refused_before_anything_is_searched(tmp_path: Path)
     assert not (tmp_path / "work").exists()
 
 
+def test_near_duplicates_among_others_are_named(tmp_path: Path) -> None:
+    capture = bad_captures.sample(6)
+    photos = list(capture.photos)
+    first = photos[3].name
+    photos[3:5] = [replace(photo, duplicate_of=first) for photo in photos[3:5]]
+    report = Report()
+    sfm.check_duplicates(replace(capture, photos=tuple(photos)), report)
+    ((code, words),) = report.warnings
+    assert code == "sfm-near-duplicates"
+    assert words.startswith(
+        f"1 of 6 photographs shows nearly the same as another: {photos[4].name}"
+    )
+
+
 @pytest.mark.slow
 def test_every_photograph_there_twice_does_no_harm(tmp_path: Path) -> None:
     pictures = enumerate(bad_captures.pictures(7))

@@ -230,7 +230,9 @@ def _check_geometry(model: ModelStatistics, thresholds: Thresholds) -> Iterator[
     elif model.flatness < thresholds.flatness and model.sideways_share < thresholds.sideways_share:
         yield _no_parallax(
             "All points lie in one plane and the cameras move straight towards it, which is what a "
-            "zoom gives: photographs"
+            "zoom gives: photographs",
+            "Walk around the scene instead of zooming or walking straight on: every photograph "
+            "should be taken from another place, a step to the side.",
         )
 
 
@@ -327,12 +329,12 @@ def _contradiction(given: str) -> SplatError:
     )
 
 
-def _no_parallax(what: str) -> SplatError:
+def _no_parallax(what: str, hint: str = MOVE) -> SplatError:
     return failure(
         "sfm-no-parallax",
         f"{what} were taken from nearly the same place.",
         "Depth can be measured only when the camera moves sideways.",
-        MOVE,
+        hint,
     )
 
 

@@ -42,8 +42,9 @@ def match_cameras(
     views = [found.views[i] for i in wanted]
     matches, missing = _matched(views, capture.photos)
     without = [p.name for i, p in enumerate(capture.photos) if i not in matches.values()]
-    allowed = allow_partial or (split and not missing)
-    _check_missing(missing, without, len(matches), allowed, report)
+    if split and not missing:
+        without = []
+    _check_missing(missing, without, len(matches), allow_partial, report)
     posed = []
     for number, position in sorted(matches.items(), key=lambda match: match[1]):
         view, photo = views[number], capture.photos[position]
