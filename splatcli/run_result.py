@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from rich.text import Text
 
 from splatcli import console, progress
-from stages.base.text import counted
+from stages.base.text import counted, listed
+from stages.evaluate.verdict import GOOD, UNKNOWN, USABLE, WRONG
 from stages.run.manifest import Manifest
 from stages.run.pipeline import Pipeline
 
@@ -27,20 +29,24 @@ _HEADLINES = {
     "quantise": ("sh_degree", "kept_mib"),
     "export": ("files", "splats"),
 }
+_STYLES = {GOOD: "green", USABLE: "yellow", WRONG: "red", UNKNOWN: ""}
 
 
 def show(pipeline: Pipeline, until: str | None) -> None:
-    """Print a table of the stages up to `until`, the exported files, and after all stages their
-    warnings again."""
+    """Print a table of the stages up to `until`, the exported files, after all stages their
+    warnings again, and last the verdict on what was trained."""
     reached = [stage.name for stage in pipeline.layout.up_to(until)]
     manifests = [m for m in map(pipeline.manifest, reached) if m is not None]
     assets = _assets(pipeline) if "export" in reached else []
+    verdict = _verdict(manifests)
     if console.mode.as_json:
         console.emit("result", **_as_data(pipeline, manifests, assets))
         return
     if console.mode.quiet:
         for path, _, _ in assets:
             console.out.print(path, markup=False)
+        if verdict.get("grade") == WRONG:
+            console.note(verdict["text"])
         return
     console.out.print()
     rows = [(m.stage, time_of(m), f"{m.peak_memory_mib:,.0f} MiB", headline(m)) for m in manifests]
@@ -61,6 +67,22 @@ def show(pipeline: Pipeline, until: str | None) -> None:
         console.note(f"\n{counted(count, 'warning')}, of all stages:")
         for manifest in manifests:
             progress.warn(manifest)
+    if verdict:
+        console.out.print()
+        console.out.print(verdict["text"], markup=False, style=_STYLES[verdict["grade"]])
+
+
+def _verdict(manifests: Sequence[Manifest]) -> dict[str, str]:
+    """The grade and the sentence; empty before training."""
+    by_stage = {manifest.stage: manifest.metrics for manifest in manifests}
+    if "verdict" not in by_stage.get("train", {}):
+        return {}
+    found: dict[str, str] = dict(by_stage["train"]["verdict"])
+    lost = by_stage.get("sfm", {}).get("unregistered_images", [])
+    if lost:
+        are = "photograph is" if len(lost) == 1 else "photographs are"
+        found["text"] += f" {len(lost)} {are} left out: {listed(lost, 3)}."
+    return found
 
 
 def time_of(manifest: Manifest) -> str:
@@ -112,5 +134,6 @@ def _as_data(
     return {
         "run_folder": str(pipeline.run_folder),
         "stages": {m.stage: {**progress.result_of(m), "device": m.device} for m in manifests},
+        "verdict": _verdict(manifests),
         "assets": [{"path": path, "size_bytes": count} for path, count, _ in assets],
     }

@@ -43,7 +43,7 @@ from stages.train.build import corrects_light, corrects_vignetting
 from stages.train.dropout import uses_dropout
 from stages.train.finetune import FineTuner
 from stages.train.history import History
-from stages.train.quality import write_history, write_quality
+from stages.train.quality import report_verdict, write_history, write_quality
 from stages.train.settings import TrainSettings
 from stages.train.stage import save
 
@@ -137,6 +137,7 @@ class _BlockTraining:
         render = image_renderer(splats, self.settings.backend)
         write_quality(render, views, settings, self.whole, folder, self.report)
         write_history(History(), folder, self.report)
+        report_verdict(splats, views, self.whole, self.settings.backend, self.report)
 
     def _coarse(self, seeds: Splats, fewer: int) -> Splats:
         settings = replace(

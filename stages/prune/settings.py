@@ -64,12 +64,15 @@ class PruneSettings:
     seconds: float = setting(
         0.0, "Time limit in seconds: no round begins after it. 0: no limit.", min=0, max=1e7
     )
+    allow_partial: bool = setting(
+        False, "Go on with a result that is wrong because photographs contradict each other."
+    )
     backend: str = backend_setting()
 
 
 STAGE = Stage(
     "prune",
-    version=23,
+    version=24,
     reads=("sfm", "train"),
     settings_type=PruneSettings,
     **in_module("stages.prune.stage"),

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from stages.base.errors import ReconstructionError, SplatError
 from stages.base.stage import Report
 from stages.evaluate.evaluation import (
     EvaluationView,
@@ -38,6 +39,7 @@ from stages.scene import (
     training_extent,
 )
 from stages.scene.storage import load_splats, save_splats
+from stages.sfm.checks.gates import STAND_STILL
 from stages.train.finetune import FineTuner
 
 
@@ -49,6 +51,8 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     """
     deadline = time.monotonic() + (settings.seconds or math.inf)
     trained: TrainedSplats = inputs["train"]
+    if trained.contradicted and not settings.allow_partial:
+        raise _contradicted()
     reconstruction: Reconstruction = inputs["sfm"].with_cameras(trained.cameras)
     splats, backend = trained.splats, settings.backend
     _check_one_splat(settings, splats, reconstruction)
@@ -81,6 +85,17 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     assert np.isfinite(found.splats.means).all()
     save_splats(folder, found.splats)
     return found.splats
+
+
+def _contradicted() -> SplatError:
+    return ReconstructionError(
+        "prune-contradictions",
+        given="The matches of several pairs of photographs contradict the cameras found, and "
+        "photographs that took no part in training are not reproduced.",
+        wanted="A scene that stands still, and cameras in their places.",
+        hint=f"{STAND_STILL} Look at the result with `splat view`. If it is right all the same, "
+        "`splat prune --allow-partial` goes on with it.",
+    )
 
 
 def pruner_of(

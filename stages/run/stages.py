@@ -20,6 +20,7 @@ STAGE_OF = {stage.name: stage for stage in STAGES}
 # Options that several stages have, and the stages that a command for a whole run gives them to.
 SHARED_OPTIONS = {
     "seed": ("sfm", "train"),  # of every random choice
+    "allow_partial": ("sfm", "prune"),  # use what failed a check
     "max_splats": ("train",),  # what `prune` is given by itself is a target, whatever the loss
     "seconds": ("train", "prune"),  # divided among them, see `pipeline.within_limit`
     "formats": ("quantise", "export"),  # what is fine-tuned to, and what is written

@@ -163,6 +163,8 @@ class Reconstruction:
         units: "metres", or "arbitrary" if the scale of the scene is unknown.
         place: where the world is on the earth; None if that is unknown.
         levelled: whether the up direction (-Y) was found from the cameras.
+        contradicted: whether the matches of some photographs contradict the cameras, so that these
+            are believed only if training can reproduce photographs that took no part in it.
     """
 
     folder: Path
@@ -175,6 +177,7 @@ class Reconstruction:
     units: str = "arbitrary"
     place: EarthPlace | None = None
     levelled: bool = False
+    contradicted: bool = False
 
     def __repr__(self) -> str:
         return f"Reconstruction({len(self.views)} views, {len(self.points):,} points)"

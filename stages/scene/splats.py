@@ -124,11 +124,13 @@ class TrainedSplats:
         splats: what was trained.
         dropout: whether some were dropped from each of the last steps (`train.dropout`).
         cameras: where training has refined them; None where it has not.
+        contradicted: whether they are wrong because photographs contradict each other.
     """
 
     splats: Splats
     dropout: bool = False
     cameras: RefinedCameras | None = None
+    contradicted: bool = False
 
 
 @dataclass(frozen=True)

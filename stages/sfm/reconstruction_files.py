@@ -29,6 +29,7 @@ def save_reconstruction(folder: Path, reconstruction: Reconstruction) -> None:
         "format": 1,
         "units": reconstruction.units,
         "levelled": reconstruction.levelled,
+        "contradicted": reconstruction.contradicted,
         "origin": [float(value) for value in reconstruction.origin],
         **({} if reconstruction.place is None else {"place": reconstruction.place.to_json()}),
         "points": len(reconstruction.points),
@@ -56,6 +57,7 @@ def load_reconstruction(folder: Path) -> Reconstruction:
             units=str(data["units"]),
             place=EarthPlace.from_json(data["place"]) if "place" in data else None,
             levelled=bool(data["levelled"]),
+            contradicted=bool(data.get("contradicted", False)),
             **arrays,
         )
 

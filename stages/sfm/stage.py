@@ -11,6 +11,7 @@ import json
 import shutil
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from stages.base.stage import Report
 from stages.base.text import counted, listed
 from stages.scene import Capture, Reconstruction
 from stages.sfm import finish, light, reconstruction_files
-from stages.sfm.checks import acceptance, attempt_runner, fallbacks
+from stages.sfm.checks import acceptance, attempt_runner, fallbacks, gates
 from stages.sfm.checks.gates import MOVE
 from stages.sfm.known.reconstruct import reconstruct
 from stages.sfm.learned.weights import INSTALL, installed
@@ -107,6 +108,8 @@ def _from_photographs(
     known_scale = KnownScale(settings.scale, settings.marker, settings.crs)
     found = finish.finish(model, capture, folder, report, known_scale)
     best = fallbacks.best_attempt(attempts)
+    some = gates.contradicted(best.statistics, gates.CONTRADICTED_SHARE)
+    found = replace(found, contradicted=some and not settings.allow_partial)
     _report_model(found, best.statistics.mean_reprojection_error_px, capture, report)
     acceptance.report_metrics(best, model, report)
     acceptance.report_joined(attempts, model, capture, report)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -48,6 +49,17 @@ class History:
     def last_psnr_db(self) -> float | None:
         """Of the last evaluation; None before the first one."""
         return self.entries[-1].psnr_db if self.entries else None
+
+    @property
+    def largest_fall_db(self) -> tuple[float, int]:
+        """(by how much the PSNR fell at most below its best value before, dB; at which step)."""
+        best, fall, step = -math.inf, 0.0, 0
+        for entry in self.entries:
+            if entry.psnr_db is not None:
+                best = max(best, entry.psnr_db)
+                if best - entry.psnr_db > fall:
+                    fall, step = best - entry.psnr_db, entry.step
+        return fall, step
 
     @property
     def most_splats(self) -> int:

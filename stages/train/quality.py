@@ -11,18 +11,23 @@ import numpy as np
 from stages.base.atomic import write_csv
 from stages.base.stage import Report
 from stages.evaluate.evaluation import (
+    LARGEST_SUBSET,
     EvaluationView,
     ImageRenderer,
     Score,
     evaluate_at_sizes,
     evaluation_subset,
+    load_evaluation_views,
     psnr_as_taken_db,
     psnr_inside_masks_db,
     psnr_name,
 )
-from stages.scene import DrawSettings, Reconstruction, split_held_out
+from stages.evaluate.verdict import Verdict, fits, verdict
+from stages.scene import DrawSettings, Reconstruction, Splats, evenly_spaced, split_held_out
 from stages.train.charts import contact_sheet, training_plot
 from stages.train.history import History
+
+WARNED_FALL_DB = 2.0  # of the held-out PSNR in training
 
 
 def write_quality(
@@ -74,6 +79,24 @@ def write_quality(
     contact_sheet(folder / "held_out.png", rows)
 
 
+def report_verdict(
+    splats: Splats,
+    views: Sequence[EvaluationView],
+    reconstruction: Reconstruction,
+    backend: str,
+    report: Report,
+) -> Verdict:
+    """The verdict on `splats`, which becomes the metric "verdict". views: held out."""
+    training = evenly_spaced(split_held_out(reconstruction.views)[0], LARGEST_SUBSET)
+    seen = load_evaluation_views(
+        reconstruction.folder, training, splats.draw_settings, report.stop_requested
+    )
+    held_out = [views[i] for i in evaluation_subset(len(views))]
+    found = verdict(fits(splats, held_out, backend), fits(splats, seen, backend))
+    report.metric("verdict", asdict(found))
+    return found
+
+
 def write_history(history: History, folder: Path, report: Report) -> None:
     """The evaluations during the run as `history.csv` and as a plot. The times, which differ
     between equal runs, go only into the report."""
@@ -83,6 +106,14 @@ def write_history(history: History, folder: Path, report: Report) -> None:
         rows.append((entry.step, entry.splats, f"{psnr_db:.4f}", f"{ssim:.5f}"))
     write_csv(folder / "history.csv", rows)
     training_plot(folder / "training.png", history.entries)
+    fall_db, step = history.largest_fall_db
+    report.metric("largest_fall_db", round(fall_db, 3))
+    if fall_db > WARNED_FALL_DB:
+        report.warn(
+            "train-quality-fell",
+            f"The PSNR of held-out photographs fell by {fall_db:.1f} dB until step {step:,}, below "
+            "what it was before. See training.png.",
+        )
     both = zip(history.entries, history.times, strict=True)
     report.metric("history", [entry.figures | asdict(elapsed) for entry, elapsed in both])
 

@@ -19,10 +19,8 @@ from stages.base.atomic import replacing
 from stages.base.bad_files import reading, stage_output
 from stages.base.errors import QualityError, ResourceError, SplatError
 from stages.base.stage import Report
-from stages.raster.backends import (
-    report_backend,
-    unavailable_backends,
-)
+from stages.evaluate.verdict import WRONG
+from stages.raster.backends import report_backend, unavailable_backends
 from stages.raster.definition import MemoryFull
 from stages.raster.smoothing import smoothed
 from stages.scene import Reconstruction, RefinedCameras, Splats, TrainedSplats
@@ -39,7 +37,7 @@ from stages.train.cap import (
 from stages.train.checkpoint import remove_checkpoint
 from stages.train.conversion import splats_of
 from stages.train.loop import train
-from stages.train.quality import write_history, write_quality
+from stages.train.quality import report_verdict, write_history, write_quality
 from stages.train.settings import PRESETS, TrainSettings
 from stages.train.trainer import Trainer
 
@@ -82,7 +80,9 @@ def run(
         reconstruction = reconstruction.with_cameras(refined)
     write_quality(trainer.render, held_out, task.draw_settings, reconstruction, folder, report)
     write_history(trainer.history, folder, report)
-    trained = TrainedSplats(splats, task.dropout, refined)
+    found = report_verdict(splats, held_out, reconstruction, task.backend, report)
+    contradicted = found.grade == WRONG and reconstruction.contradicted
+    trained = TrainedSplats(splats, task.dropout, refined, contradicted)
     save(folder, trained)
     remove_checkpoint(folder)
     remove_cap(folder)
@@ -166,7 +166,7 @@ def _nothing_left() -> SplatError:
 def save(folder: Path, trained: TrainedSplats) -> None:
     """What `load` reads. Raises SplatError."""
     save_splats(folder, trained.splats)
-    facts: dict[str, Any] = {"dropout": trained.dropout}
+    facts: dict[str, Any] = {"dropout": trained.dropout, "contradicted": trained.contradicted}
     if trained.cameras is not None:
         poses = {name: pose.tolist() for name, pose in trained.cameras.poses.items()}
         facts["cameras"] = {"poses": poses, "focal_factor": trained.cameras.focal_factor}
@@ -182,4 +182,5 @@ def load(folder: Path) -> TrainedSplats:
         if found := facts.get("cameras"):
             poses = {name: np.array(pose, np.float64) for name, pose in found["poses"].items()}
             cameras = RefinedCameras(poses, float(found["focal_factor"]))
-        return TrainedSplats(splats, bool(facts["dropout"]), cameras)
+        contradicted = bool(facts.get("contradicted"))
+        return TrainedSplats(splats, bool(facts["dropout"]), cameras, contradicted)

@@ -260,16 +260,6 @@ def test_a_plausible_model_that_is_wrong_is_refused(
 
 
 @pytest.mark.slow
-def test_a_large_object_turned_over_is_refused_by_what_the_background_says(
-    tmp_path: Path,
-) -> None:
-    capture, _ = room_captures.large_turned_over(tmp_path / "in")
-    error = failure(capture, tmp_path, max_features=3000)
-    assert error.code == "sfm-contradictions"
-    assert "masks" in error.hint
-
-
-@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_halves_joined_by_one_weak_pair_end_in_an_error_in_every_configuration(
     tmp_path: Path,

@@ -11,7 +11,7 @@ import pytest
 
 from stages.base import plots
 from stages.train import charts
-from stages.train.history import HistoryEntry
+from stages.train.history import History, HistoryEntry
 
 
 @pytest.mark.parametrize("name", ["Кухня 1.jpg", "台所.jpg", "Küche.jpg"])
@@ -63,3 +63,11 @@ def test_the_plot_of_training_has_axes_units_and_a_legend(
 def test_no_plot_of_training_without_held_out_photographs(tmp_path: Path) -> None:
     charts.training_plot(tmp_path / "a.png", [HistoryEntry(s, 5) for s in (1, 2, 3)])
     assert not list(tmp_path.iterdir())
+
+
+def test_a_fall_of_held_out_psnr_is_told_with_its_step() -> None:
+    values = (18.4, 12.2, 15.0, 18.9)
+    entries = [HistoryEntry(100 * i, 5, value) for i, value in enumerate(values, 1)]
+    fall_db, step = History(entries).largest_fall_db
+    assert (round(fall_db, 1), step) == (6.2, 200)
+    assert History([HistoryEntry(1, 5)]).largest_fall_db == (0.0, 0)

@@ -112,7 +112,7 @@ class Thresholds:
     sideways_share: float = 0.1
     distortion: float = 1.0
     focal_ratio: float = 2.0
-    inconsistent_share: float = 0.1
+    inconsistent_share: float = 0.15
     fewest_inconsistent: int = 3
     rotation_to_other_deg: float = 15.0
     cut_points: int = 30
@@ -121,7 +121,15 @@ class Thresholds:
 
 
 THRESHOLDS = Thresholds()
-WARNED_SHARE = 0.02  # of pairs that contradict a model; above, there is a warning
+CONTRADICTED_SHARE = (
+    0.02  # of pairs that contradict a model; above, training decides if it is right
+)
+
+
+STAND_STILL = (
+    "If the subject was turned or moved between photographs, hide everything else by masks (a "
+    "folder of black and white pictures, --masks), or leave out the photographs after that."
+)
 
 
 def failure(code: str, given: str, wanted: str, hint: str) -> SplatError:
@@ -207,15 +215,21 @@ def check_model(model: ModelStatistics) -> list[SplatError]:
 
 def borderline_failures(model: ModelStatistics) -> list[SplatError]:
     """Failures of stricter thresholds, which deserve a warning but do not refuse a model."""
-    stricter = Thresholds(inconsistent_share=WARNED_SHARE, cut_points=100)
+    stricter = Thresholds(cut_points=100)
     return list(_check_consistency(model, stricter))
+
+
+def contradicted(model: ModelStatistics, share: float) -> bool:
+    """Whether more than a `share` of the pairs contradict the model, and some do."""
+    bad = model.pairs_inconsistent
+    return bad >= THRESHOLDS.fewest_inconsistent and bad > share * model.pairs_checked
 
 
 def poses_contradicted(model: ModelStatistics) -> bool:
     """Whether the verified matches of so many pairs contradict the poses that they may be wrong.
     Turned pairs say nothing about that."""
     misfit = model.pairs_inconsistent - model.pairs_turned
-    share = WARNED_SHARE * model.pairs_checked
+    share = CONTRADICTED_SHARE * model.pairs_checked
     return misfit >= THRESHOLDS.fewest_inconsistent and misfit > share
 
 
@@ -295,7 +309,7 @@ def _check_support(model: ModelStatistics, thresholds: Thresholds) -> Iterator[S
 def _check_consistency(model: ModelStatistics, thresholds: Thresholds) -> Iterator[SplatError]:
     """Do the verified pairs fit the model, and are its parts well connected?"""
     bad, checked = model.pairs_inconsistent, model.pairs_checked
-    if bad >= thresholds.fewest_inconsistent and bad > thresholds.inconsistent_share * checked:
+    if contradicted(model, thresholds.inconsistent_share):
         yield _contradiction(
             f"The matches of {bad} of {checked} pairs of photographs "
             f"({' and '.join(model.inconsistent_pair)}, for example) contradict the camera poses "
@@ -323,9 +337,8 @@ def _contradiction(given: str) -> SplatError:
         "sfm-contradictions",
         given,
         "Nothing may move between photographs, and no part of the scene may look like another.",
-        "If the subject was turned or moved between photographs, put those before and those after "
-        "into folders of their own, or hide everything else by masks; if the same picture or "
-        "pattern is there twice, hide one of the two." + IF_RIGHT,
+        f"{STAND_STILL} If the same picture or pattern is there twice, hide one of the two."
+        + IF_RIGHT,
     )
 
 

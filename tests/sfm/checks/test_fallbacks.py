@@ -186,7 +186,7 @@ def test_a_model_that_the_largest_contains_needs_no_warning(other: str) -> None:
 def test_the_warning_of_a_model_that_is_used_does_not_advise_to_allow_it() -> None:
     report = Report()
     model = orbit_model(views=6, points=40)
-    report_warnings([checked(7)], model, Capture(Path(), ()), report)
+    report_warnings([checked(16)], model, Capture(Path(), ()), report)
     warning = dict(report.warnings)["sfm-contradictions"]
-    assert "7 of 100 pairs" in warning
+    assert "16 of 100 pairs" in warning
     assert "--allow-partial" not in warning
