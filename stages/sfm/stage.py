@@ -23,6 +23,7 @@ from stages.scene import Capture, Reconstruction
 from stages.sfm import finish, light, reconstruction_files
 from stages.sfm.checks import acceptance, attempt_runner, fallbacks, gates
 from stages.sfm.checks.gates import MOVE
+from stages.sfm.checks.same_place import check_one_place
 from stages.sfm.known.reconstruct import reconstruct
 from stages.sfm.learned.weights import INSTALL, installed
 from stages.sfm.place import metric_scale
@@ -84,6 +85,8 @@ def _from_photographs(
 ) -> tuple[Reconstruction, dict[str, float]]:
     """(the reconstruction, seconds by step)."""
     check_duplicates(capture, report)
+    if not settings.allow_partial and all(photo.face is None for photo in capture.photos):
+        check_one_place(capture.folder, capture.photos)
     features = usable_features(settings.features, report)
     work = folder / _WORK
     project, sift = project_of(capture, work, settings.seed), Sift(settings.max_features)

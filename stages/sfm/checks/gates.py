@@ -145,6 +145,10 @@ MOVE = (
     "Walk around the scene instead of turning on the spot: every photograph should be taken from "
     "another place, a step apart."
 )
+MOVE_ASIDE = (
+    "Walk around the scene instead of zooming or walking straight on: every photograph should be "
+    "taken from another place, a step to the side."
+)
 IF_RIGHT = " If the poses are right all the same, --allow-partial goes on with them."
 
 
@@ -183,7 +187,7 @@ def check_pairs(pairs: list[tuple[int, int, int, int]], photographs: int) -> lis
     # panoramic if it also finds no translation; a flat scene alone (drones, walls) is planar.
     rotating = sum(config in (PANORAMIC, PLANAR_OR_PANORAMIC) for _, _, _, config in pairs)
     if rotating >= THRESHOLDS.same_position_share * len(pairs):
-        failures.append(_no_parallax("Nearly all pairs of photographs"))
+        failures.append(no_parallax("Nearly all pairs of photographs"))
     groups = connected_groups(pairs, photographs)
     if len(groups[0]) < THRESHOLDS.registered_share * photographs:
         failures.append(_separate(groups, photographs))
@@ -206,7 +210,7 @@ def check_model(model: ModelStatistics) -> list[SplatError]:
         return [_timed_out(model)]
     if model.models and not model.points:
         # Photographs were registered, but all points were dropped because their rays are parallel.
-        return [_no_parallax("No depth could be measured: photographs")]
+        return [no_parallax("No depth could be measured: photographs")]
     if model.registered < THRESHOLDS.fewest_views or not model.points:
         return [_no_model(model)]
     checks = (_check_geometry, _check_camera, _check_registered, _check_support, _check_consistency)
@@ -236,17 +240,16 @@ def poses_contradicted(model: ModelStatistics) -> bool:
 def _check_geometry(model: ModelStatistics, thresholds: Thresholds) -> Iterator[SplatError]:
     angle, baseline = model.median_triangulation_angle_deg, model.baseline_over_depth
     if angle < thresholds.triangulation_angle_deg:
-        yield _no_parallax(f"The median triangulation angle is {angle:.1f} degrees: photographs")
+        yield no_parallax(f"The median triangulation angle is {angle:.1f} degrees: photographs")
     elif baseline < thresholds.baseline_over_depth:
-        yield _no_parallax(
+        yield no_parallax(
             f"The cameras moved by {baseline:.3f} of their distance to the scene: photographs"
         )
     elif model.flatness < thresholds.flatness and model.sideways_share < thresholds.sideways_share:
-        yield _no_parallax(
+        yield no_parallax(
             "All points lie in one plane and the cameras move straight towards it, which is what a "
             "zoom gives: photographs",
-            "Walk around the scene instead of zooming or walking straight on: every photograph "
-            "should be taken from another place, a step to the side.",
+            MOVE_ASIDE,
         )
 
 
@@ -342,7 +345,7 @@ def _contradiction(given: str) -> SplatError:
     )
 
 
-def _no_parallax(what: str, hint: str = MOVE) -> SplatError:
+def no_parallax(what: str, hint: str = MOVE) -> SplatError:
     return failure(
         "sfm-no-parallax",
         f"{what} were taken from nearly the same place.",
