@@ -32,7 +32,7 @@ from typing import Any
 from tests.device.parts import RUNS, SECONDS, Part
 
 ROOT = Path(__file__).resolve().parents[2]
-LEAST_S = 5.0  # a part with less time is not started
+LEAST_S = 5.0  # with less time left no part is started
 LOGGED = 60_000  # last characters of a part's output that are kept
 TOY_PATIENCE = 4.0  # by which limits grow where kernels are interpreted
 
@@ -95,7 +95,7 @@ class Run:
         now = time.monotonic()
         limit = part.limit_s * (TOY_PATIENCE if self.toy else 1.0)
         ends = min(now + limit, self.deadline)
-        if ends - now < LEAST_S:
+        if self.deadline - now < LEAST_S:
             self._note(part, {"ended": "not started: no time left"})
             return None
         words = {"RESULT": str(self._result(part)), "BUNDLE": str(self.bundle)}
