@@ -236,7 +236,7 @@ def note_compiling() -> None:
         note("Compiling the kernels; this is done once and takes about half a minute.")
 
 
-_UNITS = {"_db": " dB", "_px": " px", "_s": " s", "_mib": " MiB", "_deg": "°"}
+_UNITS = {"_db": " dB", "_px": " px", "_s": " s", "_mib": " MB", "_deg": "°"}
 
 
 def figures(numbers: Mapping[str, Any]) -> str:
@@ -257,6 +257,8 @@ def figure(name: str, value: Any) -> str:
     unit = next((u for suffix, u in _UNITS.items() if name.endswith(suffix)), "")
     if isinstance(value, bool):
         return "yes" if value else "no"
+    if name.endswith("_mib"):
+        return size(value * 2**20)
     if isinstance(value, int):
         return f"{value:,}{unit}"
     if isinstance(value, float):

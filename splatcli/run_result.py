@@ -49,10 +49,10 @@ def show(pipeline: Pipeline, until: str | None) -> None:
             console.note(verdict["text"])
         return
     console.out.print()
-    rows = [(m.stage, time_of(m), f"{m.peak_memory_mib:,.0f} MiB", headline(m)) for m in manifests]
+    rows = [(m.stage, time_of(m), memory(m.peak_memory_mib), headline(m)) for m in manifests]
     total_s = sum(m.seconds for m in manifests)
     peak_mib = max((m.peak_memory_mib for m in manifests), default=0.0)
-    rows.append(("all", console.duration(total_s), f"{peak_mib:,.0f} MiB", ""))
+    rows.append(("all", console.duration(total_s), memory(peak_mib), ""))
     console.table(("stage", "time", "peak memory", "result"), rows)
     if assets:
         console.out.print()
@@ -70,6 +70,7 @@ def show(pipeline: Pipeline, until: str | None) -> None:
     if verdict:
         console.out.print()
         console.out.print(verdict["text"], markup=False, style=_STYLES[verdict["grade"]])
+        console.out.print(f"Look at it: splat view {pipeline.run_folder}", markup=False)
 
 
 def _verdict(manifests: Sequence[Manifest]) -> dict[str, str]:
@@ -83,6 +84,11 @@ def _verdict(manifests: Sequence[Manifest]) -> dict[str, str]:
         are = "photograph is" if len(lost) == 1 else "photographs are"
         found["text"] += f" {len(lost)} {are} left out: {listed(lost, 3)}."
     return found
+
+
+def memory(mib: float) -> str:
+    """Peak memory as people read it."""
+    return console.size(mib * 2**20)
 
 
 def time_of(manifest: Manifest) -> str:

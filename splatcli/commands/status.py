@@ -50,7 +50,7 @@ def _print(pipeline: Pipeline, steps: list[Step], busy: int | None) -> None:
                 f"{s.number}-{s.stage.name}",
                 _state(s, busy),
                 run_result.time_of(s.manifest) if s.manifest else "-",
-                f"{s.manifest.peak_memory_mib:,.0f} MiB" if s.manifest else "-",
+                run_result.memory(s.manifest.peak_memory_mib) if s.manifest else "-",
                 s.reason or (run_result.headline(s.manifest) if s.manifest else ""),
             )
             for s in steps

@@ -101,6 +101,9 @@ def about_capture(photos: Sequence[Photo], warn: Warn) -> list[str]:
             "An object or a room needs 20 to 50: take more, in small steps around the scene, with "
             "60-80 % overlap."
         )
+        if all(photo.camera.startswith("video, ") for photo in photos):
+            what = "different frame"
+            wanted = "An object or a room needs 20 to 50: film on while you walk around the scene."
         if panoramas == len(photos):
             what = "usable 360-degree picture"
             wanted = f"A room needs about {FEWEST_PANORAMAS}: take more, each a step from the last."

@@ -112,6 +112,9 @@ def test_a_capture_that_is_soft_all_over_is_reported() -> None:
 
 def test_too_few_are_reported() -> None:
     assert set(codes([photo(i) for i in range(5)])) == {"ingest-few-photographs"}
+    film = codes([photo(i, camera="video, 1920x1080 a.mp4") for i in range(8)])
+    assert "8 different frames" in film["ingest-few-photographs"]
+    assert "film on" in film["ingest-few-photographs"]
 
 
 def test_twelve_panoramas_are_enough_for_a_room() -> None:

@@ -1,0 +1,61 @@
+"""What is printed when a run is done."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from splatcli import console, run_result
+
+
+def shown(capsys: pytest.CaptureFixture[str], verdict: dict[str, str]) -> str:
+    """The output for a run of `sfm` and `train`."""
+    metrics: dict[str, Any] = {
+        "sfm": {"unregistered_images": ["b.jpg"]},
+        "train": {"verdict": verdict},
+    }
+    manifests = {
+        name: SimpleNamespace(
+            stage=name,
+            seconds=2.0,
+            cpu_seconds=2.0,
+            peak_memory_mib=100.0,
+            metrics=values,
+            warnings=[],
+        )
+        for name, values in metrics.items()
+    }
+    pipeline: Any = SimpleNamespace(
+        layout=SimpleNamespace(up_to=lambda until: [SimpleNamespace(name=n) for n in manifests]),
+        manifest=manifests.get,
+        stage_folder=lambda name: Path("run") / name,
+        run_folder=Path("run"),
+    )
+    run_result.show(pipeline, "train")
+    return capsys.readouterr().out
+
+
+def test_the_last_lines_are_the_verdict_and_how_to_look_at_the_result(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    lines = shown(capsys, {"grade": "usable", "text": "Usable: it is soft."}).splitlines()
+    assert lines[-2] == "Usable: it is soft. 1 photograph is left out: b.jpg."
+    assert lines[-1] == "Look at it: splat view run"
+
+
+def test_memory_is_in_the_unit_of_the_files(capsys: pytest.CaptureFixture[str]) -> None:
+    out = shown(capsys, {"grade": "good", "text": "Good."})
+    assert "105 MB" in out or "104.9 MB" in out
+    assert "MiB" not in out
+
+
+def test_quiet_runs_tell_only_of_a_wrong_result(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(console.mode, "quiet", True)
+    assert shown(capsys, {"grade": "good", "text": "Good."}) == ""
+    run_result_text = {"grade": "wrong", "text": "Wrong, do not use it."}
+    shown(capsys, run_result_text)
