@@ -102,21 +102,22 @@ def run(
         "views": len(decider.views),
         "psnr_by_sh_degree_db": {str(d): by_degree[d] for d in sorted(by_degree)},
     }
-    for name, value in figures.items():
-        report.metric(name, value)
-    report.metric("raw_mib", round(_bytes(splats) / 2**20, 3))
-    report.metric("kept_mib", round(_bytes(kept) / 2**20, 3))
-    report.metric("evaluated_side_px", splats.draw_settings.side)
+    _report(figures, {"raw_mib": splats, "kept_mib": kept}, report)
     report_backend(report, settings.backend)
     quantised = replace(quantised, sog_bits=bits)
-    finetuned = finetuning.to_rounding(
-        quantised,
-        earlier.quantised.finetuned if earlier else {},
-        earlier.finetuning if earlier else {},
-    )
-    quantised = replace(quantised, finetuned=finetuned)
+    known = (earlier.quantised.finetuned, earlier.finetuning) if earlier else ({}, {})
+    quantised = replace(quantised, finetuned=finetuning.to_rounding(quantised, *known))
     _save(folder, quantised, decisions)
     return quantised
+
+
+def _report(figures: Mapping[str, Any], sizes: Mapping[str, Splats], report: Report) -> None:
+    """The figures, and the memory of splats by the name of its metric."""
+    for name, value in figures.items():
+        report.metric(name, value)
+    for name, splats in sizes.items():
+        report.metric(name, round(_bytes(splats) / 2**20, 3))
+        report.metric("evaluated_side_px", splats.draw_settings.side)
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ import shlex
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -180,18 +181,20 @@ class Pipeline:
                 planner = Planner(self.layout, run_file.photographs, wanted)
                 self._check_allowed(planner, until, may_run)
                 run_file.write(self.run_folder)
-
-                def forget(refusing: Stage) -> None:
-                    if before.settings_of([refusing])[refusing.name] != wanted[refusing.name]:
-                        later = self.layout.stages[self.layout.number(refusing) - 1 :]
-                        names = {stage.name for stage in later}
-                        run_file.with_settings_from(before, names).write(self.run_folder)
-
+                forget = partial(self._forget, before, run_file)
                 return self._run_all(planner, until, stopped, listener, forget)
         except OSError as error:
             raise self._unusable(error) from error
         finally:
             listener.ended()
+
+    def _forget(self, before: RunFile, changed: RunFile, refusing: Stage) -> None:
+        """Record the settings of a stage that refused, and of later ones, as they were `before`, if
+        the command `changed` those of the stage."""
+        if before.settings_of([refusing]) != changed.settings_of([refusing]):
+            later = self.layout.stages[self.layout.number(refusing) - 1 :]
+            names = {stage.name for stage in later}
+            changed.with_settings_from(before, names).write(self.run_folder)
 
     def _run_all(
         self,

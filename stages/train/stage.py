@@ -39,7 +39,7 @@ from stages.train.conversion import splats_of
 from stages.train.loop import train
 from stages.train.quality import report_verdict, write_history, write_quality
 from stages.train.settings import PRESETS, TrainSettings
-from stages.train.trainer import Trainer
+from stages.train.trainer import Trainer, TrainingTask
 
 _TRAINED = "training.json"
 _FEW_STEPS = 500  # with a time limit
@@ -60,11 +60,7 @@ def run(
     start: Splats = inputs["seed"]
     trainer = make_trainer(reconstruction, len(start), settings, folder, report)
     task = trainer.task
-    report_backend(report, task.backend)
-    report.metric("device", report.device)
-    report.metric("unavailable_backends", unavailable_backends(settings.backend))
-    report.metric("training_views", len(task.views))
-    report.metric("held_out_views", len(task.held_out))
+    _report_task(task, settings, report)
     try:
         model = train(trainer, start)
     except MemoryFull as full:
@@ -98,6 +94,14 @@ def run(
     _report_cap(trainer.cap, trainer.history.most_splats, report)
     report.metric("train_seconds", round(time.monotonic() - started, 1))
     return trained
+
+
+def _report_task(task: TrainingTask, settings: TrainSettings, report: Report) -> None:
+    report_backend(report, task.backend)
+    report.metric("device", report.device)
+    report.metric("unavailable_backends", unavailable_backends(settings.backend))
+    report.metric("training_views", len(task.views))
+    report.metric("held_out_views", len(task.held_out))
 
 
 def _report_course(trainer: Trainer, report: Report) -> None:
