@@ -139,7 +139,7 @@ def check_duplicates(capture: Capture, report: Report) -> None:
     Warns if some of the photographs are."""
     sources = {photo.source: photo.duplicate_of for photo in capture.photos}
     alike = [(name, first) for name, first in sources.items() if first not in ("", name)]
-    different = len(sources) - len(alike)
+    different = len({first or name for name, first in sources.items()})
     if different < _FEWEST_PHOTOGRAPHS:
         raise ReconstructionError(
             "sfm-no-parallax",

@@ -141,7 +141,7 @@ def test_a_film_that_breaks_off_is_used_as_far_as_it_goes(tmp_path: Path) -> Non
     whole = video.read_bytes()
     video.write_bytes(whole[: len(whole) * 55 // 100])
     capture, warnings, report = ingested(video, tmp_path / "out")
-    assert 3 <= len(capture.photos) < 22
+    assert numbers(capture)[-1] < report.metrics["videos"][0]["frames"]
     assert 20 < report.metrics["videos"][0]["frames"] < 80
     assert "walk.mp4 is damaged, 2 s at its end are missing" in warnings["ingest-video-damaged"]
 
