@@ -113,7 +113,8 @@ def about_photographs(tradeoff: Tradeoff) -> list[str]:
         f"{worst.psnr_db:.2f} dB, {tradeoff.own.psnr_db - worst.psnr_db:.2f} below the mean."
     ]
     if count < FEWEST_SHOWN:
-        lines.append(f"{counted(count, 'held-out view')} are too few for intervals.")
+        are = "is" if count == 1 else "are"
+        lines.append(f"{counted(count, 'held-out view')} {are} too few for intervals.")
     elif count < 8:
         lines.append(f"There are only {counted(count, 'held-out view')}: intervals are wide.")
     return lines

@@ -29,9 +29,7 @@ _FEATURES = 1000
 _RATIO = 0.8  # of the distances to the nearest and the second nearest descriptor (Lowe 2004)
 _FEWEST_MATCHES = 40
 _FEWEST_PAIRS = 4
-_MOST = (
-    0.75  # of the pairs; of 19 captures with parallax none, at a turn or a zoom all
-)
+_MOST = 0.75  # of the pairs; of 19 captures with parallax none, at a turn or a zoom all
 _ZOOMED = 1.15  # ratio of focal lengths
 _AWAY_PX = 1.5  # of a match that fits
 _SHARE = 0.9  # of the matches that fit an epipolar geometry
