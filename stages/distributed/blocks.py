@@ -27,6 +27,7 @@ from stages.distributed import block_folders, merge, partition
 from stages.distributed.partition import Cell
 from stages.distributed.tasks import Executor, OpenExecutor, RunTask, resources_of, run_all
 from stages.evaluate.evaluation import image_renderer, load_evaluation_views
+from stages.evaluate.verdict import WRONG, Verdict
 from stages.run.listener import Listener
 from stages.run.pipeline import Pipeline
 from stages.scene import (
@@ -123,21 +124,23 @@ class _BlockTraining:
         crossing = [v for v, across in zip(self.whole.views, crosses, strict=True) if across]
         seam_views = [view for view in crossing if view in training]
         trained = self._merge(parts, cells, seam_views, draw_settings, len(training))
+        found = self._evaluate(trained.splats, held, folder)
+        wrong = found.grade == WRONG and self.whole.contradicted
+        trained = replace(trained, contradicted=wrong)
         save(folder, trained)
-        self._evaluate(trained.splats, held, folder)
         self.report.metric("training_views", len(training))
         self.report.metric("held_out_views", len(held))
         self.report.metric("views_across_blocks", [view.name for view in crossing])
         self.report.metric("train_seconds", round(time.monotonic() - started, 1))
         return trained
 
-    def _evaluate(self, splats: Splats, held: Sequence[View], folder: Path) -> None:
+    def _evaluate(self, splats: Splats, held: Sequence[View], folder: Path) -> Verdict:
         settings = splats.draw_settings
         views = load_evaluation_views(self.whole.folder, held, settings)
         render = image_renderer(splats, self.settings.backend)
         write_quality(render, views, settings, self.whole, folder, self.report)
         write_history(History(), folder, self.report)
-        report_verdict(splats, views, self.whole, self.settings.backend, self.report)
+        return report_verdict(splats, views, self.whole, self.settings.backend, self.report)
 
     def _coarse(self, seeds: Splats, fewer: int) -> Splats:
         settings = replace(
