@@ -11,6 +11,13 @@ import pytest
 from splatcli import console, run_result
 
 
+@pytest.fixture(autouse=True)
+def for_people(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever other commands of this process asked for."""
+    monkeypatch.setattr(console.mode, "as_json", False)
+    monkeypatch.setattr(console.mode, "quiet", False)
+
+
 def shown(capsys: pytest.CaptureFixture[str], verdict: dict[str, str]) -> str:
     """The output for a run of `sfm` and `train`."""
     metrics: dict[str, Any] = {
@@ -57,5 +64,4 @@ def test_quiet_runs_tell_only_of_a_wrong_result(
 ) -> None:
     monkeypatch.setattr(console.mode, "quiet", True)
     assert shown(capsys, {"grade": "good", "text": "Good."}) == ""
-    run_result_text = {"grade": "wrong", "text": "Wrong, do not use it."}
-    shown(capsys, run_result_text)
+    assert shown(capsys, {"grade": "wrong", "text": "Wrong, do not use it."}) == ""

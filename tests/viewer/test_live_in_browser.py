@@ -91,6 +91,7 @@ def until(browser: Browser, script: str) -> Any:
 
 def bare(browser: Browser, address: str) -> None:
     """The page with nothing before the picture."""
+    browser.open("about:blank")  # the page before asks no more
     browser.requests.clear()
     browser.open(address)
     browser.run(
