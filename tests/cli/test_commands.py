@@ -119,8 +119,8 @@ def test_output_that_cannot_be_written_is_one_error(splat, monkeypatch, capsys, 
         with pytest.raises(SystemExit) as end:
             app(words.split())
     assert end.value.code == (2 if words.startswith("nope") else 6)
-    told = capsys.readouterr().err
-    assert ("command-line" if words.startswith("nope") else "output-not-written") in told
+    printed = capsys.readouterr().err
+    assert ("command-line" if words.startswith("nope") else "output-not-written") in printed
 
 
 def test_code_of_photographs_that_are_not_there_is_the_documented_one(splat) -> None:

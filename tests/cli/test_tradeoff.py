@@ -104,13 +104,13 @@ def test_commands_take_the_newest_splats_that_are_made_from_what_lies_there(spla
     made(splat, "run")
     assert json.loads(splat("info", "run", "--json").stdout)["splats_from"] == "quantise"
     assert splat("train", "run", "--steps", "30").exit_code == 0
-    told = splat("info", "run", "--json")
-    facts = json.loads(told.stdout)
+    shown = splat("info", "run", "--json")
+    facts = json.loads(shown.stdout)
     assert facts["splats_from"] == "train"
     assert facts["out_of_date"] == ["prune", "quantise", "export"]
-    assert "train ran again since prune, quantise, export did" in told.stderr
-    told = splat("edit", "run", "--dry-run", "--keep", "opacity > 0.1")
-    assert "These are the splats of train" in told.stderr
+    assert "train ran again since prune, quantise, export did" in shown.stderr
+    shown = splat("edit", "run", "--dry-run", "--keep", "opacity > 0.1")
+    assert "These are the splats of train" in shown.stderr
 
 
 def test_a_run_compared_with_itself_has_no_significant_difference(splat: Splat) -> None:

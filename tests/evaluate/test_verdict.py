@@ -1,4 +1,4 @@
-"""The verdict: what is good, usable and wrong, and what a photographer is told."""
+"""The verdict: what is good, usable and wrong, and what a photographer reads."""
 
 from __future__ import annotations
 

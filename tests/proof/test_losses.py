@@ -1,4 +1,4 @@
-"""What a file lost is told by `convert` and `edit` alike: how much, why, and what to do."""
+"""`convert` and `edit` report alike what a file lost: how much, why, and what to do."""
 
 from __future__ import annotations
 

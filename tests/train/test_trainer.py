@@ -473,9 +473,9 @@ def test_a_time_limit_that_left_few_steps_is_a_warning(tmp_path, monkeypatch, se
     report = Report()
     (tmp_path / "out").mkdir()
     train.run(inputs, settings, tmp_path / "out", report)
-    told = dict(report.warnings).get("train-few-steps", "")
+    warned = dict(report.warnings).get("train-few-steps", "")
     steps = report.metrics["steps"]
-    assert told.startswith(f"The time limit left {steps:,} steps") if seconds else not told
+    assert warned.startswith(f"The time limit left {steps:,} steps") if seconds else not warned
 
 
 def test_splats_have_no_more_parameters_than_the_views_have_values(tmp_path, monkeypatch):

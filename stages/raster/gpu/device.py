@@ -1,6 +1,7 @@
 """The device of the Triton kernels: a GPU, or for tests Triton's interpreter (TRITON_INTERPRET=1).
 
-torch and Triton are imported at first use.
+torch and Triton are imported inside functions, at first use: they take a second, and machines
+without a GPU do not need them.
 """
 
 from __future__ import annotations
