@@ -48,9 +48,10 @@ def convert(
         console.step(f"writing {target}", done=1, total=_STEPS)
         make_folder(target.parent)
         with replacing_asset(target) as written:
-            formats.write(written, splats, units=formats.units_of(source))
+            views = results.views_of(results.run_around(source))
+            formats.write(written, splats, units=formats.units_of(source), views=views)
             console.step(f"comparing {target}", done=2, total=_STEPS)
-            cameras = cameras_for(splats, results.views_of(results.run_around(source)))
+            cameras = cameras_for(splats, views)
             prover = Prover.of(splats, cameras, source_format=rows[0].ending)
             found, losses = require_proven(written, prover, "convert-verify-failed")
     size = rows[1].size_bytes(target)

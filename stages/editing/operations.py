@@ -154,7 +154,8 @@ def join(first: Splats, second: Splats) -> Splats:
     means = exact.astype(first.means.dtype)
     _refuse_rounded(np.abs(exact - means).max(axis=1, initial=0.0), exact, second)
     both = concatenate([first, replace(second, means=means)])
-    return replace(both, origin=first.origin, place=first.place, draw_settings=first.draw_settings)
+    kept = {name: getattr(first, name) for name in ("origin", "place", "first_camera")}
+    return replace(both, **kept, draw_settings=first.draw_settings)
 
 
 def _refuse_rounded(

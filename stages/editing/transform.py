@@ -76,6 +76,8 @@ class Similarity:
             if sh is not splats.sh:
                 sh[rows] = np.einsum("km,nmc->nkc", sh_rotation, splats.sh[rows].astype(np.float64))
         place = splats.place and splats.place.moved(self.inverse_matrix)
+        in_means = replace(self, offset=left)
+        camera = splats.first_camera and in_means.apply_to_camera(splats.first_camera)
         return replace(
             splats,
             means=means,
@@ -84,6 +86,7 @@ class Similarity:
             sh=sh,
             origin=linear @ splats.origin + shift + 0.0,
             place=place,
+            first_camera=camera,
             draw_settings=replace(
                 splats.draw_settings, near=splats.draw_settings.near * self.scale
             ),

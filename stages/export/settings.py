@@ -38,7 +38,7 @@ class ExportSettings:
 
 STAGE = Stage(
     "export",
-    version=12,
+    version=13,
     reads=("sfm", "quantise"),
     settings_type=ExportSettings,
     adds="formats",

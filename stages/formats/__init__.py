@@ -24,6 +24,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -64,7 +65,8 @@ def write(
         path: the file to write.
         splats: in our conventions: y down, ln scales, logit opacities.
         units: "metres" or "arbitrary", noted in the formats that can hold it.
-        views: cameras in the frame of `splats.means`, for the formats that hold cameras.
+        views: cameras in the frame of `splats.means`, for the formats that hold cameras, or the
+            first.
         coarser: coarser levels of detail, finest first, for the formats that hold levels.
 
     Returns how many splats could not be drawn (values not finite, or too large) and were left out.
@@ -78,6 +80,9 @@ def write(
     if row.streamed:
         more["coarser"] = coarser
     splats, dropped = values.drop_undrawable(splats)
+    if views:
+        first = min(views, key=lambda view: view.name)
+        splats = replace(splats, first_camera=first.camera)
     codecs.CODECS[row.ending].write(Path(path), splats, units=units, **more)
     if not row.holds_origin:
         offset.write_offset(Path(path), row, splats, units)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -17,16 +18,20 @@ from stages.base.atomic import replacing
 from stages.base.distribution import VERSION
 from stages.base.errors import UsageError
 from stages.base.row_slices import row_slices
+from stages.formats.first_camera import NAME, pose_of
 from stages.formats.json_fields import location_fields
-from stages.scene import Splats
+from stages.scene import Camera, Splats
+from stages.scene.draw_settings import near_plane_of
 from stages.scene.flip import flipped
 from stages.scene.place import EarthPlace
+from stages.scene.rotations import quaternions_of
 
 EXTENSION = "KHR_gaussian_splatting"
 _COMPONENT_TYPES = {"<f4": 5126, "<i2": 5122, "<u2": 5123, "|u1": 5121, "<u4": 5125}
 _GLB_LIMIT_BYTES = (1 << 32) - 1
 _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
 _POINTS = 0
+_DIGITS = 9  # of rotations, whose last digits depend on the machine
 
 
 @dataclass(frozen=True)
@@ -53,14 +58,16 @@ def write_file(
     *,
     node_scale: float = 1.0,
 ) -> None:
-    """Write one node of splats as `path` (.glb, or .gltf with its .bin), completely or not at all.
+    """Write a node of splats, and one of their first camera if it is known, as `path` (.glb, or
+    .gltf with its .bin), completely or not at all.
 
     Args:
         path: the file.
         primitives: attributes by name, all with the same number of rows, y up.
-        splats: for what asset.extras holds: origin and place, in the axes of the file, because
-            positions relative to 0 would exceed the precision of float32; whether they are to be
-            drawn with opacity compensation: KHR_gaussian_splatting has no field for it.
+        splats: for the camera, and for what asset.extras holds: origin and place, in the axes of
+            the file, because positions relative to 0 would exceed the precision of float32; whether
+            they are to be drawn with opacity compensation: KHR_gaussian_splatting has no field for
+            it.
         units: "metres" or "arbitrary".
         node_scale: scale of the node.
 
@@ -70,6 +77,9 @@ def write_file(
     y_up = flipped(splats.take(slice(0)))
     made_of = asset(units, y_up.origin, y_up.place, **more)
     document = _document(primitives, made_of, node_scale)
+    if primitives and y_up.first_camera is not None:
+        near = splats.draw_settings.near or near_plane_of(splats.means)
+        _add_camera(document, y_up.first_camera, near)
     written = [attribute for attributes in primitives for attribute in attributes.values()]
     write = write_glb if path.suffix.lower() == ".glb" else _write_pair
     write(path, document, written)
@@ -100,6 +110,27 @@ def _document(
         "meshes": [{"primitives": described, "name": "splats"}],
         **buffer_fields(written),
     }
+
+
+def _add_camera(document: dict[str, Any], camera: Camera, near: float) -> None:
+    """Add a camera, in the axes of the file, to the scene. near: its near plane."""
+    pose = pose_of(camera)
+    lens = {
+        "yfov": 2 * math.atan(camera.height / camera.fy / 2),
+        "aspectRatio": camera.width / camera.fx / (camera.height / camera.fy),
+        "znear": near,
+    }
+    document["cameras"] = [{"type": "perspective", "perspective": lens, "name": NAME}]
+    turn = quaternions_of(pose[:3, :3])[[1, 2, 3, 0]]
+    document["scenes"][0]["nodes"].append(len(document["nodes"]))
+    document["nodes"].append(
+        {
+            "camera": 0,
+            "name": NAME,
+            "rotation": [round(float(v), _DIGITS) for v in turn],
+            "translation": pose[:3, 3].tolist(),
+        }
+    )
 
 
 def buffer_fields(written: Iterable[tuple[str, Attribute]]) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -19,15 +20,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError
+from stages.formats.first_camera import camera_of
 from stages.formats.json_fields import located, numbers, whole
 from stages.formats.values import concatenate, log_scales_of, logits_of
-from stages.scene import Splats
+from stages.scene import Camera, Splats
 from stages.scene.flip import flipped
-from stages.scene.recentring import recentred
+from stages.scene.recentring import recentred_splats
+from stages.scene.rotations import matrices_of
 
 _EXTENSION = "KHR_gaussian_splatting"
 _TYPES = {5120: "i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_ASPECT = 4 / 3  # of cameras that state none
 _MIN_SPLAT_BYTES = 12 + 4 + 3 + 1 + 12  # with every attribute at its narrowest type
 
 
@@ -35,16 +39,17 @@ def read(path: Path) -> Splats:
     """All splats of the scene, y down, float32.
 
     Nodes may be translated and uniformly scaled; positions far from zero keep their precision in
-    `origin`. Raises BadFileError for a damaged file, one without splats, one that refers to files
-    outside its folder, or an unsupported feature (sparse accessors, compression,
-    rotated nodes).
+    `origin`. Of cameras the first in perspective is kept. Raises BadFileError for a damaged file,
+    one without splats, one that refers to files outside its folder, or an unsupported feature
+    (sparse accessors, compression, splats in rotated nodes).
     """
     document, chunk = _parse(path)
     buffers = _Buffers(path, _list(document, "buffers"), chunk)
     source = _Source(document, buffers)
     parts: list[Splats] = []
-    for node, transform in _nodes(document):
-        for part in source.splats(node, transform):
+    nodes = _nodes(document)
+    for node, matrix in nodes:
+        for part in source.splats(node, matrix):
             parts.append(part)
             # Splats that are not shared cannot be more than this, which bounds the memory.
             if sum(map(len, parts)) * _MIN_SPLAT_BYTES > buffers.total_bytes():
@@ -56,9 +61,8 @@ def read(path: Path) -> Splats:
     splats = concatenate(parts)
     del parts
     splats = located(splats, extras)
-    means, origin = recentred(splats.means.astype(np.float64), splats.origin)
-    splats = replace(splats, means=means, origin=origin)
-    splats = splats.with_antialias(bool(extras.get("antialiased", False)))
+    splats = replace(splats, first_camera=_first_camera(document, nodes))
+    splats = recentred_splats(splats).with_antialias(bool(extras.get("antialiased", False)))
     return flipped(splats, reuse=True)
 
 
@@ -154,11 +158,11 @@ def _file_beside(path: Path, uri: str) -> Path:
     return target
 
 
-_Transform = tuple[float, NDArray[np.float64]]  # x -> scale x + offset
+_Placed = tuple[dict[str, Any], NDArray[np.float64]]  # a node, and [4, 4] from it to the world
 
 
-def _nodes(document: dict[str, Any]) -> list[tuple[dict[str, Any], _Transform]]:
-    """The nodes of the scene with their transform to the world; each node at most once."""
+def _nodes(document: dict[str, Any]) -> list[_Placed]:
+    """The nodes of the scene, each at most once."""
     nodes, scenes = _list(document, "nodes"), _list(document, "scenes")
     if scenes:
         index = document.get("scene", 0)
@@ -168,41 +172,52 @@ def _nodes(document: dict[str, Any]) -> list[tuple[dict[str, Any], _Transform]]:
             child for node in nodes if isinstance(node, dict) for child in _list(node, "children")
         }
         roots = [index for index in range(len(nodes)) if index not in children]
-    waiting: list[tuple[Any, _Transform]] = [
-        (index, (1.0, np.zeros(3))) for index in reversed(roots)
+    waiting: list[tuple[Any, NDArray[np.float64]]] = [
+        (index, np.eye(4)) for index in reversed(roots)
     ]
-    found: list[tuple[dict[str, Any], _Transform]] = []
+    found: list[_Placed] = []
     seen: set[int] = set()
     while waiting:
-        index, (scale, offset) = waiting.pop()
+        index, parent = waiting.pop()
         node = _item(nodes, index, "node")
         if index in seen:
             raise BadFileError("a node has two parents")
         seen.add(index)
-        inner_scale, inner_offset = _transform_of(node)
-        transform = scale * inner_scale, offset + scale * inner_offset
-        found.append((node, transform))
-        waiting += [(child, transform) for child in reversed(_list(node, "children"))]
+        matrix = parent @ _matrix_of(node)
+        found.append((node, matrix))
+        waiting += [(child, matrix) for child in reversed(_list(node, "children"))]
     return found
 
 
-def _transform_of(node: dict[str, Any]) -> _Transform:
+def _matrix_of(node: dict[str, Any]) -> NDArray[np.float64]:
+    """[4, 4] from a node to its parent."""
     if "matrix" in node:
-        matrix = numbers(node, "matrix", 16).reshape(4, 4).T
-        scale, offset = float(matrix[0, 0]), matrix[:3, 3]
-        even = np.array_equal(matrix[:3, :3], scale * np.eye(3))
-        if not even or not np.array_equal(matrix[3], [0, 0, 0, 1]):
-            raise BadFileError("one of its nodes is rotated or stretched, which is not supported")
-    else:
-        rotation = numbers(node, "rotation", 4, [0, 0, 0, 1])
-        scales = numbers(node, "scale", 3, [1, 1, 1])
-        offset = numbers(node, "translation", 3, [0, 0, 0])
-        scale = float(scales[0])
-        if np.abs(rotation[:3]).max() > 1e-7 or not (scales == scale).all():
-            raise BadFileError("one of its nodes is rotated or stretched, which is not supported")
-    if not scale > 0:
-        raise BadFileError("one of its nodes has a scale that is not positive")
-    return scale, offset
+        return numbers(node, "matrix", 16).reshape(4, 4).T
+    x, y, z, w = numbers(node, "rotation", 4, [0, 0, 0, 1])
+    matrix = np.eye(4)
+    matrix[:3, :3] = matrices_of(np.array([w, x, y, z])) * numbers(node, "scale", 3, [1, 1, 1])
+    matrix[:3, 3] = numbers(node, "translation", 3, [0, 0, 0])
+    return matrix
+
+
+def _scale_and_offset(matrix: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+    """(scale, offset [3]) of a node with splats. Raises BadFileError for other transforms."""
+    scale = float(matrix[0, 0])
+    uneven = np.abs(matrix[:3, :3] - scale * np.eye(3)).max()
+    if not (scale > 0 and uneven <= 1e-6 * scale and np.array_equal(matrix[3], [0, 0, 0, 1])):
+        raise BadFileError("its splats are rotated, mirrored or stretched, which is not supported")
+    return scale, matrix[:3, 3]
+
+
+def _first_camera(document: dict[str, Any], nodes: list[_Placed]) -> Camera | None:
+    """The first camera in perspective, in the axes of the file; None if there is none."""
+    for node, matrix in nodes:
+        if "camera" in node:
+            described = _item(_list(document, "cameras"), node["camera"], "camera")
+            if isinstance(lens := described.get("perspective"), dict):
+                high = 2 * math.tan(float(lens.get("yfov", 0)) / 2)
+                return camera_of(matrix, high * float(lens.get("aspectRatio", _ASPECT)), high)
+    return None
 
 
 @dataclass(frozen=True)
@@ -210,7 +225,7 @@ class _Source:
     document: dict[str, Any]
     buffers: _Buffers
 
-    def splats(self, node: dict[str, Any], transform: _Transform) -> Iterator[Splats]:
+    def splats(self, node: dict[str, Any], matrix: NDArray[np.float64]) -> Iterator[Splats]:
         """The splats of a node's mesh, primitive after primitive, in the file's axes."""
         if "mesh" not in node:
             return
@@ -218,10 +233,15 @@ class _Source:
         for primitive in _list(mesh, "primitives"):
             extensions = primitive.get("extensions") if isinstance(primitive, dict) else None
             if isinstance(extensions, dict) and isinstance(extensions.get(_EXTENSION), dict):
-                yield self._primitive(primitive, extensions[_EXTENSION], transform)
+                placed = _scale_and_offset(matrix)
+                yield self._primitive(primitive, extensions[_EXTENSION], *placed)
 
     def _primitive(
-        self, primitive: dict[str, Any], extension: dict[str, Any], transform: _Transform
+        self,
+        primitive: dict[str, Any],
+        extension: dict[str, Any],
+        scale: float,
+        offset: NDArray[np.float64],
     ) -> Splats:
         if extension.get("kernel") != "ellipse":
             raise BadFileError("its splats have another kernel than ellipse")
@@ -256,9 +276,9 @@ class _Source:
                 sh[:, d * d + i] = coefficient
         return Splats(
             # float64: `read` recentres them
-            means=means.astype(np.float64) * transform[0] + transform[1],
+            means=means.astype(np.float64) * scale + offset,
             quaternions=rotations[:, [3, 0, 1, 2]],
-            log_scales=log_scales_of(scales, transform[0]),
+            log_scales=log_scales_of(scales, scale),
             opacity_logits=logits_of(opacities[:, 0]),
             sh=sh,
             sh_degrees=np.full(len(means), degree, np.uint8),

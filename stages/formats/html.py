@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import base64
 import binascii
+import json
 import re
 import tempfile
 import zlib
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from stages.base.atomic import replacing
@@ -20,7 +21,7 @@ from stages.base.bad_files import BadFileError
 from stages.formats import ply
 from stages.formats.inflate import check_size
 from stages.page import document
-from stages.page.cameras import PageCamera, page_cameras
+from stages.page.cameras import PageCamera, camera_of, page_cameras
 from stages.scene import Camera, Splats, View
 
 _GZIP = 31  # wbits of zlib for the gzip container, whose header then holds no time
@@ -125,7 +126,17 @@ def read(path: Path) -> Splats:
         with inside.open("wb") as file:
             for block in _unzipped(path):
                 file.write(block)
-        return ply.read(inside)
+        return replace(ply.read(inside), first_camera=_first_camera(path))
+
+
+def _first_camera(path: Path) -> Camera:
+    """The first camera of a page. Raises what a damaged page causes."""
+    start, end = document.SCENE_START.encode("ascii"), document.CHUNK_END.encode("ascii")
+    with path.open("rb") as page:
+        while line := page.readline(_LINE_LIMIT_BYTES):
+            if line.startswith(start) and line.endswith(end):
+                return camera_of(json.loads(line[len(start) : -len(end)])["shots"][0])
+    raise BadFileError("it holds no description of a scene")
 
 
 def _unzipped(path: Path) -> Iterator[bytes]:

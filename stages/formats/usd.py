@@ -18,12 +18,16 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import partial_prefix, replacing
 from stages.base.row_slices import row_slices
+from stages.formats.first_camera import NAME, pose_of
 from stages.formats.values import linear_opacities, linear_scales, unit_quaternions
-from stages.scene import Splats
+from stages.scene import Camera, Splats
+from stages.scene.draw_settings import near_plane_of
 from stages.scene.flip import flipped
 from stages.scene.rotations import matrices_of
 
 _ROOT, _PRIM = "/Scene", "/Scene/Splats"
+_FOCAL_LENGTH = 50.0  # of the schema
+_FAR = 1e6  # the far plane, in near planes
 
 
 def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
@@ -85,9 +89,26 @@ def _layer(splats: Splats, units: str, suffix: str) -> Any:
     field.CreateSortingModeHintAttr(UsdVol.Tokens.zDepth)  # as the splats were trained
     if len(splats):
         field.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(_extent(base)))
+    _add_camera(stage, y_up.first_camera, splats)
     colour = Usd.ColorSpaceAPI.Apply(field.GetPrim())
     colour.CreateColorSpaceNameAttr("srgb_rec709_scene")
     return layer
+
+
+def _add_camera(stage: Any, camera: Camera | None, splats: Splats) -> None:
+    """Define the first camera, which is in the axes of the file, if it is known."""
+    from pxr import Gf, UsdGeom
+
+    if camera is None or not len(splats):
+        return
+    prim = UsdGeom.Camera.Define(stage, f"{_ROOT}/{NAME}")
+    prim.AddTransformOp().Set(Gf.Matrix4d(*pose_of(camera).T.ravel().tolist()))
+    # Apertures and focal length are in the same unit: only their ratios matter.
+    prim.CreateFocalLengthAttr(_FOCAL_LENGTH)
+    prim.CreateHorizontalApertureAttr(_FOCAL_LENGTH * camera.width / camera.fx)
+    prim.CreateVerticalApertureAttr(_FOCAL_LENGTH * camera.height / camera.fy)
+    near = splats.draw_settings.near or near_plane_of(splats.means)
+    prim.CreateClippingRangeAttr(Gf.Vec2f(near, near * _FAR))
 
 
 def _filled(kind: Any, splats: Splats, values_of: Callable[[Splats], NDArray[Any]]) -> Any:

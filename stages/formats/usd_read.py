@@ -7,6 +7,7 @@ stages.scene.storage) or the declared units to OUTPUT, or prints the reason why 
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 import tempfile
@@ -22,6 +23,7 @@ from stages.base.bad_files import BadFileError
 from stages.base.parent import end_child, how_it_ended, python_module, start_child
 from stages.base.text import reason_of
 from stages.base.usd_path import accepted_path
+from stages.formats.first_camera import camera_of
 from stages.formats.json_fields import place_of
 from stages.formats.values import (
     allows_nonfinite,
@@ -31,9 +33,9 @@ from stages.formats.values import (
     logits_of,
     nonfinite_allowed,
 )
-from stages.scene import Splats, load_splats, save_splats
+from stages.scene import Camera, Splats, load_splats, save_splats
 from stages.scene.flip import flipped
-from stages.scene.recentring import recentred
+from stages.scene.recentring import recentred_splats
 
 _TYPE = "ParticleField3DGaussianSplat"
 _ARCS = ("references", "payload", "inheritPaths", "specializes", "clips")
@@ -49,8 +51,9 @@ def read(path: Path) -> Splats:
     """All Gaussian splats of a USD file, y down, float32.
 
     Prims may be translated and uniformly scaled; the up axis must be y. Positions far from zero
-    keep their precision in `origin`. Raises BadFileError for a damaged file, one without splats,
-    one that refers to other files, or one with rotated prims.
+    keep their precision in `origin`. Of cameras the first in perspective is kept. Raises
+    BadFileError for a damaged file, one without splats, one that refers to other files, or one
+    with rotated splats.
     """
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "splats.bin"
@@ -100,10 +103,22 @@ def _parsed(stage: Any) -> Splats:
     note = _note(stage)
     origin = np.array(note.get("origin", np.zeros(3)), np.float64).reshape(3)
     place = place_of(note.get("place"), origin)
-    means, origin = recentred(splats.means.astype(np.float64), origin)
-    splats = replace(splats, means=means, origin=origin, place=place)
-    splats = splats.with_antialias(bool(note.get("antialiased", False)))
+    splats = replace(splats, origin=origin, place=place, first_camera=_first_camera(stage))
+    splats = recentred_splats(splats).with_antialias(bool(note.get("antialiased", False)))
     return check_finite(flipped(splats, reuse=True))
+
+
+def _first_camera(stage: Any) -> Camera | None:
+    """The first camera in perspective, in the axes of the file; None if there is none."""
+    from pxr import Usd, UsdGeom
+
+    for camera in map(UsdGeom.Camera, stage.Traverse()):
+        if camera and camera.GetProjectionAttr().Get() == UsdGeom.Tokens.perspective:
+            pose = np.array(camera.ComputeLocalToWorldTransform(Usd.TimeCode.Default())).T
+            attributes = (camera.GetHorizontalApertureAttr(), camera.GetVerticalApertureAttr())
+            focal = camera.GetFocalLengthAttr().Get() or math.nan
+            return camera_of(pose, *(attribute.Get() / focal for attribute in attributes))
+    return None
 
 
 def _note(stage: Any) -> dict[str, Any]:

@@ -17,6 +17,7 @@ import numpy as np
 from stages.page.cameras import PageCamera, as_plain
 from stages.scene import Splats
 
+SCENE_START = '<script type="application/json" id="scene">'
 CHUNK_START = '<script type="text/plain" class="splats">'
 CHUNK_END = "</script>\n"
 PAGE_END = "</body>\n</html>\n"
@@ -99,7 +100,7 @@ def _head(scene: dict[str, Any], style: str) -> str:
         f"<title>{html.escape(scene['title'])}</title>\n"
         f"<style>\n{style}\n{_asset('parts', 'page.css')}</style>\n</head>\n<body>\n"
         f"{_asset('parts', 'body.html')}<script>\n{_asset('parts', 'failure.js')}</script>\n"
-        f'<script type="application/json" id="scene">{data}</script>\n'
+        f"{SCENE_START}{data}{CHUNK_END}"
     )
 
 

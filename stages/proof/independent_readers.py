@@ -160,11 +160,12 @@ def _gltf_parts(path: Path) -> tuple[Any, list[_Buffer]]:
 
 
 def _node_scale(document: Any) -> float:
-    """The scale of the only node. Raises NotCrossCheckedError for another placement."""
-    scales = [node.scale or [1.0, 1.0, 1.0] for node in document.nodes]
+    """The scale of the only node but cameras. Raises NotCrossCheckedError for another placement."""
+    nodes = [node for node in document.nodes if node.camera is None]
+    scales = [node.scale or [1.0, 1.0, 1.0] for node in nodes]
     moved = any(
         any(node.translation or ()) or any((node.rotation or ())[:3]) or node.matrix
-        for node in document.nodes
+        for node in nodes
     )
     single = len(scales) == 1 and len(set(scales[0])) == 1
     if moved or len(document.meshes) > 1 or not (single or all(s == [1] * 3 for s in scales)):

@@ -46,7 +46,8 @@ def flipped(splats: Splats, *, reuse: bool = False) -> Splats:
             arrays[name] = np.multiply(values, sign, out=values if reuse else None)
     # + 0.0: an origin of -0 would be written as such
     origin, place = splats.origin * FLIP + 0.0, flipped_place(splats.place)
-    return replace(splats, **arrays, origin=origin, place=place)
+    camera = splats.first_camera and splats.first_camera.moved(np.diag([*FLIP, 1.0]))
+    return replace(splats, **arrays, origin=origin, place=place, first_camera=camera)
 
 
 def flipped_place(place: EarthPlace | None) -> EarthPlace | None:

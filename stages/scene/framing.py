@@ -21,6 +21,11 @@ _FREE = 0.05  # part of that width's area that a side must be freer by
 _LENS = 0.8  # focal length in widths
 
 
+def first_camera(splats: Splats) -> Camera:
+    """The first camera that the splats come with; else one in front of them."""
+    return splats.first_camera or front_camera(splats)
+
+
 def front_camera(splats: Splats) -> Camera:
     """A camera a little above the densest part of the splats, near enough to be inside a room
     around it, on the side where least lies between; in front (-z) if several sides are free."""

@@ -3,8 +3,12 @@ coordinates."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
+
+from stages.scene.splats import Splats
 
 # A float32 has a significand of 24 bits (IEEE 754). A scene that is farther from zero than 1000
 # times its own spread has less than 14 bits left for the differences between its splats. Within
@@ -34,3 +38,14 @@ def recentred(
             shift = np.rint(middle)
     with np.errstate(over="ignore"):
         return (means - shift).astype(np.float32), origin + shift
+
+
+def recentred_splats(splats: Splats) -> Splats:
+    """Splats that `recentred` moved: their means, now float32, origin and first camera."""
+    means, origin = recentred(splats.means.astype(np.float64), splats.origin)
+    camera = splats.first_camera
+    if camera is not None:
+        shift = np.eye(4)
+        shift[:3, 3] = origin - splats.origin
+        camera = camera.moved(shift)
+    return replace(splats, means=means, origin=origin, first_camera=camera)

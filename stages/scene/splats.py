@@ -33,6 +33,7 @@ class Splats:
         positions near zero keep their precision however far away the capture lies.
     draw_settings: how they are drawn and evaluated.
     place: where these coordinates are on the earth; None if that is unknown.
+    first_camera: where a viewer begins, in the frame of `means`; None if that is unknown.
     """
 
     means: NDArray[np.floating]
@@ -44,6 +45,7 @@ class Splats:
     origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     draw_settings: DrawSettings = field(default_factory=DrawSettings)
     place: EarthPlace | None = None
+    first_camera: Camera | None = None
 
     def __post_init__(self) -> None:
         n = len(self.means)

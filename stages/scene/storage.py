@@ -1,9 +1,10 @@
 """Splats on disk between stages: exact, deterministic, and quick to load.
 
 Layout: the 8 bytes of `MAGIC`, then each array in the order of `FIELDS` and one for `DrawSettings`,
-in NumPy's .npy format (version 1.0). Where the splats have a place on the earth, a last array holds
-its JSON in UTF-8. There is no compression and no timestamp (a zip file, and so .npz, would have
-them), so equal splats give equal bytes.
+in NumPy's .npy format (version 1.0). Where the splats have a place on the earth, an array of bytes
+follows with its JSON in UTF-8, and where they have a first camera, one of its numbers. There is no
+compression and no timestamp (a zip file, and so .npz, would have them), so equal splats give equal
+bytes.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.base.bad_files import reading, stage_output
+from stages.scene.camera import Camera
 from stages.scene.draw_settings import DrawSettings
 from stages.scene.place import EarthPlace
 from stages.scene.splats import ROW_FIELDS, Splats
@@ -27,6 +29,7 @@ from stages.scene.splats import ROW_FIELDS, Splats
 MAGIC = b"SPLATS5\n"
 FIELDS = (*ROW_FIELDS, "origin")
 FILE_NAME = "splats.bin"
+_CAMERA = ("width", "height", "fx", "fy", "cx", "cy", "world_to_camera")
 _DTYPES = {"<f4", "<f8", "|u1"}
 
 
@@ -48,6 +51,9 @@ def save_splats(path: Path, splats: Splats) -> Path:
         if splats.place is not None:
             text = np.frombuffer(json.dumps(splats.place.to_json()).encode(), np.uint8)
             npy.write_array(file, text, version=(1, 0), allow_pickle=False)
+        if splats.first_camera is not None:
+            *lens, pose = (getattr(splats.first_camera, name) for name in _CAMERA)
+            npy.write_array(file, np.array([*lens, *pose.flat], "<f8"), version=(1, 0))
     return target
 
 
@@ -64,16 +70,27 @@ def load_splats(path: Path) -> Splats:
         arrays = {name: _read_array(file, size, name) for name in FIELDS}
         drawn = _read_array(file, size, "draw settings").astype(np.float64)
         near, side, grey, *flags = drawn
-        place = None
-        if file.tell() < size:
-            place = EarthPlace.from_json(json.loads(_read_array(file, size, "place").tobytes()))
-        if file.read(1):
-            raise ValueError("bytes follow its end")
+        place, camera = None, None
+        while file.tell() < size:
+            array = _read_array(file, size, "what follows")
+            if array.dtype == np.uint8 and place is None and camera is None:
+                place = EarthPlace.from_json(json.loads(array.tobytes()))
+            elif array.shape == (22,) and camera is None:
+                width, height, fx, fy, cx, cy = array[:6].tolist()
+                pose = array[6:].astype(np.float64).reshape(4, 4)
+                camera = Camera(int(width), int(height), fx, fy, cx, cy, pose)
+            else:
+                raise ValueError("bytes follow its end")
         light, antialias, vignetting = map(bool, flags)
         draw_settings = DrawSettings(
             float(near), int(side), float(grey), light, antialias, vignetting
         )
-        return Splats(**arrays, draw_settings=draw_settings, place=place)  # type: ignore[arg-type]
+        return Splats(
+            **arrays,  # type: ignore[arg-type]
+            draw_settings=draw_settings,
+            place=place,
+            first_camera=camera,
+        )
 
 
 def _file_of(path: Path) -> Path:

@@ -11,7 +11,7 @@ from stages.base.errors import UsageError
 from stages.base.text import counted
 from stages.cameras.camera_formats import read_cameras
 from stages.scene import Camera, Splats, View
-from stages.scene.framing import front_camera
+from stages.scene.framing import first_camera
 from stages.viewer import camera_paths, orbit
 
 _TURN_S = 8.0  # the default duration of one turn around the scene
@@ -53,12 +53,12 @@ def camera_of_view(splats: Splats, views: Sequence[View], name: str | None) -> C
     Args:
         views: sorted by name; may be empty.
         name: the view's name, the last part of its name, or its number; None for the first view,
-            or for a camera in front of the splats if there are no views.
+            or for the first camera of the splats if there are no views.
 
     Raises SplatError "render-camera".
     """
     if name is None:
-        return views[0].camera if views else front_camera(splats)
+        return views[0].camera if views else first_camera(splats)
     for candidates in (
         [view.camera for view in views if view.name == name],
         [view.camera for view in views if view.name.rpartition("/")[2] == name],
@@ -99,7 +99,7 @@ def path_cameras(
 
 
 def _orbit(cameras: list[Camera], splats: Splats, duration: Duration) -> CameraPath:
-    cameras = cameras or [front_camera(splats)]
+    cameras = cameras or [first_camera(splats)]
     half = orbit.arc_seen(cameras, splats)[1]
     notes: tuple[str, ...] = ()
     if half < math.pi:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from stages import formats
+from tests import scenes
 from tests.formats.files import edited_glb
 from tests.formats.truth import many_splats
 from tests.readers.validators import gltf_complaints, usd_complaints
@@ -20,7 +22,8 @@ pytestmark = pytest.mark.slow
 @pytest.mark.parametrize("degree", [0, 3])
 @pytest.mark.usefixtures("packages")
 def test_gltf_files_are_valid(tmp_path: Path, suffix: str, degree: int) -> None:
-    formats.write(tmp_path / f"a.{suffix}", many_splats(50).with_sh_degree(degree))
+    splats = replace(many_splats(50).with_sh_degree(degree), first_camera=scenes.camera(640, 480))
+    formats.write(tmp_path / f"a.{suffix}", splats)
     assert gltf_complaints(tmp_path / f"a.{suffix}") == []
 
 
@@ -50,7 +53,8 @@ def test_a_wrong_glb_does_not_pass(
 
 @pytest.mark.parametrize("suffix", ["usda", "usdc", "usdz"])
 def test_usd_files_are_valid(tmp_path: Path, suffix: str) -> None:
-    formats.write(tmp_path / f"a.{suffix}", many_splats(50))
+    splats = replace(many_splats(50), first_camera=scenes.camera(640, 480))
+    formats.write(tmp_path / f"a.{suffix}", splats)
     assert usd_complaints(tmp_path / f"a.{suffix}") == []
 
 

@@ -96,7 +96,7 @@ def test_the_asset_s_own_page_shows_it_wherever_it_is_served(
 ) -> None:
     browser.open(address + "lod-meta.html?bare&webgl")
     shown = browser.run("window.splatReady")
-    assert (shown["name"], shown["splats"]) == ("in front", SPLATS)
+    assert (shown["name"], shown["splats"]) == ("first view", SPLATS)
     assert browser.picture().max() > 0.5
     assert asset.with_suffix(".html") in formats.format_of(asset).files(asset)
 
