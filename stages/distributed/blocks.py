@@ -40,7 +40,7 @@ from stages.scene import (
     split_held_out,
     training_extent,
 )
-from stages.train.build import corrects_light, corrects_vignetting
+from stages.train.build import corrects_light
 from stages.train.dropout import uses_dropout
 from stages.train.finetune import FineTuner
 from stages.train.history import History
@@ -101,12 +101,10 @@ class _BlockTraining:
         """The merged splats, written to `folder` as training writes them."""
         started = time.monotonic()
         light = corrects_light(self.whole, self.settings.light, self.report)
-        vignetting = corrects_vignetting(self.whole, self.settings.light, self.report)
         if not light:
             views = tuple(replace(view, light=None) for view in self.whole.views)
             self.whole = replace(self.whole, views=views)
-        one_choice = "auto" if light or vignetting else "off"
-        self.settings = replace(self.settings, light=one_choice)
+        self.settings = replace(self.settings, light="auto" if light else "off")
         coarse = self._coarse(seeds, max(blocks, COARSE_SPLATS))
         training, held = split_held_out(self.whole.views)
         points, weights = partition.weighted_points(replace(self.whole, views=training))
@@ -118,7 +116,7 @@ class _BlockTraining:
         folders = self._blocks(seeds, coarse, cells, assigned, partition.margin(points))
         parts = self._parts(folders, cells, assigned)
         draw_settings = draw_settings_of(
-            self.whole.views, self.settings.train_side, light, self.settings.antialias, vignetting
+            self.whole.views, self.settings.train_side, light, self.settings.antialias
         )
         crosses = partition.crosses_blocks(assigned)
         crossing = [v for v, across in zip(self.whole.views, crosses, strict=True) if across]

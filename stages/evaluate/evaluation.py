@@ -20,7 +20,7 @@ from stages.base.errors import Interrupted
 from stages.evaluate.image_metrics import capped_psnr_db, flip, has_flip, ssim
 from stages.raster.draw import renderer
 from stages.scene import IGNORE, TRANSPARENT, Camera, DrawSettings, Splats, View
-from stages.scene.light import BRIGHT, OFFSET, Light, gains_and_offsets, vignetting_gains
+from stages.scene.light import BRIGHT, Light, gains_and_offsets
 from stages.scene.pictures import load_image, mask_of, scaled_image, scaled_mask
 
 IN_MEMORY_MIB = 512  # of photographs; further ones are read from disk each time
@@ -150,7 +150,7 @@ class _EvaluationViews(Sequence[EvaluationView]):
         self._stop_if_requested()
         view, draw_settings = self._views[number], self._draw_settings
         camera = draw_settings.camera(view.camera)
-        found = load_evaluation_view(self._folder, view, camera, draw_settings.vignetting)
+        found = load_evaluation_view(self._folder, view, camera)
         return found.in_median_light(view.light if draw_settings.light else None).over(
             draw_settings.background
         )
@@ -167,20 +167,11 @@ def load_evaluation_views(
     return _EvaluationViews(folder, views, draw_settings, stop)
 
 
-def load_evaluation_view(
-    folder: Path, view: View, camera: Camera, vignetting: bool = False
-) -> EvaluationView:
+def load_evaluation_view(folder: Path, view: View, camera: Camera) -> EvaluationView:
     """The view's picture in `folder` on the camera's pixel grid, over black where it is
-    transparent. vignetting: whether it is corrected. Raises SplatError."""
+    transparent. Raises SplatError."""
     picture = load_image(folder / view.image, camera.width, camera.height)
     mask = mask_of(folder, view, camera.width, camera.height)
-    if vignetting and view.vignetting:
-        black = np.full((*picture.shape[:2], 1), OFFSET, np.float32)
-        if mask is not None and view.outside == TRANSPARENT:
-            black *= mask[..., None] * np.float32(1 / 255)
-        gains = vignetting_gains(view.vignetting, camera)[..., None]
-        largest = np.where(picture < BRIGHT, BRIGHT - 1 / 255, 1)  # what was measured stays so
-        picture = ((picture + black) / gains - black).clip(0, largest)
     pixels = np.round(picture * 255).astype(np.uint8)
     if mask is not None and view.outside == TRANSPARENT:
         pixels[mask == 0] = 0  # where JPEG left traces of an edge
@@ -246,7 +237,7 @@ def psnr_as_taken_db(
         map of each channel that was fitted to the left halves.
     """
     unadapted, adapted = [], []
-    as_taken = replace(draw_settings, light=False, vignetting=False)
+    as_taken = replace(draw_settings, light=False)
     for view in load_evaluation_views(folder, views, as_taken):
         image, truth = np.clip(draw(view.camera), 0.0, 1.0), view.image
         half, everywhere = truth.shape[1] // 2, np.ones(truth.shape[:2], bool)

@@ -72,7 +72,7 @@ class PruneSettings:
 
 STAGE = Stage(
     "prune",
-    version=24,
+    version=25,
     reads=("sfm", "train"),
     settings_type=PruneSettings,
     **in_module("stages.prune.stage"),

@@ -63,7 +63,7 @@ class QuantiseSettings:
 
 STAGE = Stage(
     "quantise",
-    version=14,
+    version=15,
     reads=("sfm", "train", "prune"),
     settings_type=QuantiseSettings,
     adds="formats",

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.scene.camera import Camera
-from stages.scene.light import Light, Vignetting
+from stages.scene.light import Light
 from stages.scene.place import EarthPlace
 
 Item = TypeVar("Item")
@@ -112,7 +112,6 @@ class View:
         role: "train" or "test" where a benchmark defines the split; "" elsewhere.
         light: exposure and white balance, see `scene.light`; None if they could not be measured.
         frame: the name of the panorama or wide fisheye that this is a face of; "" for a photograph.
-        vignetting: of its camera, see `scene.light`; None if none was found.
     """
 
     name: str
@@ -125,7 +124,6 @@ class View:
     light: Light | None = None
     frame: str = ""
     depth: str = ""
-    vignetting: Vignetting | None = None
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,6 @@ class DrawSettings:
             none.
         background: grey level behind everything, 0 to 1: black, or white for cut-out photographs.
         light: whether photographs are corrected to their median light (`scene.light`) first.
-        vignetting: whether their vignetting is corrected.
         antialias: whether opacities are reduced by as much as the rasteriser's dilation enlarges
             the area of a splat: the 2D Mip filter of Mip-Splatting (Yu et al. 2024, section 4.2).
             Splats are trained for one of the two and look wrong when they are drawn as the other.
@@ -38,7 +37,6 @@ class DrawSettings:
     background: float = 0.0
     light: bool = False
     antialias: bool = False
-    vignetting: bool = False
 
     def camera(self, camera: Camera) -> Camera:
         """`camera` at the size of training and evaluation; never enlarged."""
@@ -50,13 +48,12 @@ def draw_settings_of(
     side: int = 0,
     light: bool = False,
     antialias: bool = False,
-    vignetting: bool = False,
 ) -> DrawSettings:
     """How splats trained on these views are drawn, by the training views among them. The others: as
     in `DrawSettings`."""
     cut_out = any(view.outside == TRANSPARENT for view in views)
     near = NEAR_SHARE * scene_extent(split_held_out(views)[0])
-    return DrawSettings(near, side, float(cut_out), light, antialias, vignetting)
+    return DrawSettings(near, side, float(cut_out), light, antialias)
 
 
 def near_plane_of(means: NDArray[np.floating]) -> float:

@@ -69,7 +69,7 @@ def load_splats(path: Path) -> Splats:
             raise ValueError("it does not start as a splats file")
         arrays = {name: _read_array(file, size, name) for name in FIELDS}
         drawn = _read_array(file, size, "draw settings").astype(np.float64)
-        near, side, grey, *flags = drawn
+        near, side, grey, light, antialias = drawn[:5]  # files of earlier versions have six
         place, camera = None, None
         while file.tell() < size:
             array = _read_array(file, size, "what follows")
@@ -81,9 +81,8 @@ def load_splats(path: Path) -> Splats:
                 camera = Camera(int(width), int(height), fx, fy, cx, cy, pose)
             else:
                 raise ValueError("bytes follow its end")
-        light, antialias, vignetting = map(bool, flags)
         draw_settings = DrawSettings(
-            float(near), int(side), float(grey), light, antialias, vignetting
+            float(near), int(side), float(grey), bool(light), bool(antialias)
         )
         return Splats(
             **arrays,  # type: ignore[arg-type]

@@ -17,7 +17,7 @@ class SeedSettings:
 
 STAGE = Stage(
     "seed",
-    version=7,
+    version=8,
     reads=("sfm",),
     settings_type=SeedSettings,
     **in_module("stages.seed.stage"),

@@ -13,5 +13,5 @@ In reading order, without known cameras:
 With known cameras: `known`.
 
 Both end in `finish`: `place` finds up, scale and north, and `undistorted_images` writes pictures.
-Then `light` measures exposure and vignetting, and `reconstruction_files` stores the result.
+Then `light` measures exposure and white balance, and `reconstruction_files` stores the result.
 """

@@ -80,7 +80,6 @@ def _view_to_dict(view: View) -> dict[str, Any]:
         **({"mask": view.mask, "outside": view.outside} if view.mask else {}),
         **({"depth": view.depth} if view.depth else {}),
         **({"light": list(view.light)} if view.light else {}),
-        **({"vignetting": list(view.vignetting)} if view.vignetting else {}),
         **({"frame": view.frame} if view.frame else {}),
         "width": camera.width,
         "height": camera.height,
@@ -93,5 +92,7 @@ def _view_from_dict(data: dict[str, Any]) -> View:
     matrix = np.array(data.pop("world_to_camera"), np.float64).reshape(4, 4)
     numbers = {name: data.pop(name) for name in ("width", "height", *_INTRINSICS)}
     camera = Camera(**numbers, world_to_camera=matrix)
-    data |= {name: tuple(data[name]) for name in ("light", "vignetting") if name in data}
+    if "light" in data:
+        data["light"] = tuple(data["light"])
+    data.pop("vignetting", None)  # of earlier versions
     return View(camera=camera, **data)

@@ -31,10 +31,9 @@ def make_trainer(
     began = time.monotonic()
     kept, held = split_held_out(reconstruction.views)
     light = corrects_light(reconstruction, settings.light, report)
-    vignetting = corrects_vignetting(reconstruction, settings.light, report)
-    train = load_views(reconstruction.folder, kept, settings.train_side, folder, light, vignetting)
+    train = load_views(reconstruction.folder, kept, settings.train_side, folder, light)
     draw_settings = draw_settings_of(
-        reconstruction.views, settings.train_side, light, settings.antialias, vignetting
+        reconstruction.views, settings.train_side, light, settings.antialias
     )
     held_out = load_evaluation_views(reconstruction.folder, held, draw_settings)
     _warn_of_small_photographs(reconstruction, settings.train_side, report)
@@ -106,15 +105,6 @@ def _on_the_host(backend: str, report: Report) -> str:
         "Cameras are refined on the CPU: --refine-in-training does not use the GPU yet.",
     )
     return "cpu"
-
-
-def corrects_vignetting(reconstruction: Reconstruction, choice: str, report: Report) -> bool:
-    """Whether the vignetting of the views is corrected; choice as in `corrects_light`.
-
-    Structure from motion measures it, and stores only what differs from a scene's shading."""
-    corrects = choice != "off" and any(view.vignetting for view in reconstruction.views)
-    report.metric("vignetting_corrected", corrects)
-    return corrects
 
 
 def corrects_light(reconstruction: Reconstruction, choice: str, report: Report) -> bool:

@@ -55,7 +55,7 @@ def write_quality(
             "train-nothing-held-out",
             "Too few photographs to hold one out: quality was not measured.",
         )
-    if (draw_settings.light or draw_settings.vignetting) and scores:
+    if draw_settings.light and scores:
         _, held = split_held_out(reconstruction.views)
         unadapted, adapted = psnr_as_taken_db(render, reconstruction.folder, held, draw_settings)
         report.metric("psnr_as_taken_db", round(unadapted, 3))

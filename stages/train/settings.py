@@ -66,7 +66,7 @@ class TrainSettings:
     )
     light: str = setting(
         "auto",
-        "Bring all photographs to the median exposure and white balance, and correct vignetting, "
+        "Bring all photographs to the median exposure and white balance "
         "before training: auto (what the points of all parts of the scene agree about) or off.",
         panel="Light and masks",
         choices=("auto", "off"),
@@ -110,7 +110,7 @@ PRESETS: dict[str, TrainSettings] = {
 
 STAGE = Stage(
     "train",
-    version=32,
+    version=33,
     reads=("sfm", "seed"),
     settings_type=TrainSettings,
     **in_module("stages.train.stage"),

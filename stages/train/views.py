@@ -112,7 +112,6 @@ def load_views(
     train_side: int,
     work: Path,
     light: bool = False,
-    vignetting: bool = False,
 ) -> list[TrainingView]:
     """The training views at their resolutions.
 
@@ -122,7 +121,6 @@ def load_views(
         train_side: largest length of the longer side at full resolution, pixels.
         work: folder for a file with all pixels, which is mapped into memory.
         light: whether to correct exposure and white balance.
-        vignetting: whether to correct it.
 
     Raises SplatError, and OSError if the disk is full.
     """
@@ -133,7 +131,7 @@ def load_views(
             full = view.camera.fitted(max(16, train_side))
             for scale in SCALES:
                 camera = full.fitted(max(16, round(max(full.width, full.height) * scale)))
-                photograph = load_evaluation_view(folder, view, camera, vignetting)
+                photograph = load_evaluation_view(folder, view, camera)
                 masked = photograph.mask, view.outside
                 kept_light = view.light if light else None
                 levels.add(Level.from_pixels(camera, photograph.pixels, *masked, kept_light))

@@ -44,7 +44,7 @@ from stages.run.pipeline import Pipeline
 from stages.run.stages import STAGE_NAMES, STAGE_OF
 from stages.scene import Reconstruction, Splats, draw_settings_of, split_held_out
 from stages.sfm.settings import SfmSettings
-from stages.train.build import corrects_light, corrects_vignetting
+from stages.train.build import corrects_light
 from stages.train.settings import PRESETS, TrainSettings
 from tests.benchmarks.captures import SOURCES, photographs_of
 from tests.benchmarks.sample_test_views import evaluation_views
@@ -94,10 +94,7 @@ class Capture:
         """Those with a longer side of at most `side` pixels."""
         choice = TrainSettings().light
         light = corrects_light(self.reconstruction, choice, Report())
-        vignetting = corrects_vignetting(self.reconstruction, choice, Report())
-        settings = draw_settings_of(
-            self.reconstruction.views, side, light=light, vignetting=vignetting
-        )
+        settings = draw_settings_of(self.reconstruction.views, side, light=light)
         _, held = split_held_out(self.reconstruction.views)
         found = tuple(load_evaluation_views(self.reconstruction.folder, held, settings))
         if self.name != SAMPLE:

@@ -1,4 +1,4 @@
-"""Whether training corrects the light and the vignetting of photographs."""
+"""Whether training corrects the light of photographs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from stages.base.stage import Report
 from stages.scene import Reconstruction
 from stages.scene.light import Light
-from stages.train.build import corrects_light, corrects_vignetting
+from stages.train.build import corrects_light
 from tests.small_scene import small_scene
 
 
@@ -34,13 +34,3 @@ def test_the_light_that_structure_from_motion_found_is_corrected_unless_it_is_of
     assert corrects_light(lit(tmp_path, light), choice, report) is corrects
     assert [code for code, _ in report.warnings] == ["train-light-evened"] * corrects
     assert report.metrics["light_corrected"] is corrects
-
-
-def test_vignetting_is_corrected_where_it_was_found(tmp_path: Path) -> None:
-    even = small_scene(tmp_path, views=4).reconstruction
-    views = (replace(even.views[0], vignetting=(0.3, 0.0, 0.0)), *even.views[1:])
-    assert corrects_vignetting(replace(even, views=views), "auto", Report())
-    assert not corrects_vignetting(even, "auto", Report())
-    report = Report()
-    assert not corrects_vignetting(replace(even, views=views), "off", report)
-    assert report.metrics["vignetting_corrected"] is False
