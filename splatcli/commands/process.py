@@ -15,7 +15,6 @@ from stages.cameras.camera_formats import read_cameras
 from stages.run import runfolder
 from stages.run.listener import Listener, Listeners
 from stages.run.pipeline import Pipeline
-from stages.run.runfile import RunFile
 from stages.run.stages import STAGE_NAMES
 from stages.sfm.known.match_cameras import check_split
 from stages.viewer.live_training import LiveTraining
@@ -130,12 +129,6 @@ def _run(
 ) -> None:
     """Run the pipeline and print the result. view: show the training on a page, too."""
     log.write_settings(settings)
-    recorded = RunFile.read(pipeline.run_folder)
-    if recorded is not None and recorded.rebuilt:
-        console.warn(
-            f"run.json of {pipeline.run_folder} is missing or damaged. It is rebuilt from the "
-            "folders of the stages; settings of stages that never began are the defaults."
-        )
     listeners: list[Listener] = [log.LogListener(), progress.listener_for(console.mode)]
     if view:
         listeners.insert(0, _live_training(pipeline))

@@ -23,7 +23,6 @@ from stages.run.digests import FileRecords, records_from_data
 
 SCHEMA = 2  # of manifests and `run.json`; raised when their keys or settings are renamed
 MANIFEST = "manifest.json"
-EDITED = "manifest-edited"  # code of the error for a damaged manifest or `run.json`
 
 
 @dataclass(frozen=True)
@@ -176,9 +175,9 @@ def _seal(body: Mapping[str, Any]) -> str:
 def edited(path: Path) -> SplatError:
     """The error for a file of a run folder that is not as splat wrote it."""
     what = f"the folder {path.parent}" if path.name == MANIFEST else path
-    again = "its stage runs again" if path.name == MANIFEST else "it is written again"
+    again = "its stage runs again" if path.name == MANIFEST else "give all options again"
     return RunFolderError(
-        EDITED,
+        "manifest-edited",
         given=f"{path} was changed after it was written, or is damaged.",
         wanted="The file as splat wrote it: later stages depend on it.",
         hint=f"Restore the file, or delete {what}: then {again}. Nothing else is lost.",

@@ -1,8 +1,8 @@
 """`run.json`: the photographs of a run folder, and the settings last requested.
 
 A folder with this file is a run folder. `splat train` continues with the settings in it, and
-`splat status` tells from it what would run again. If the file is lost or damaged, the folders of
-the stages identify the run folder, and the settings are read from them.
+`splat status` tells from it what would run again. If the file is lost, the stages' folders still
+identify the run folder; photographs and options have to be given again.
 """
 
 from __future__ import annotations
@@ -14,9 +14,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from stages.base.errors import SplatError
 from stages.base.stage import Stage
-from stages.run.manifest import EDITED, MANIFEST, edited, read_sealed, write_sealed
+from stages.run.manifest import MANIFEST, edited, read_sealed, write_sealed
 from stages.run.request import REQUEST, settings_from_data, settings_to_data
 
 RUN_FILE = "run.json"
@@ -24,33 +23,22 @@ RUN_FILE = "run.json"
 
 @dataclass(frozen=True)
 class RunFile:
-    """photographs: absolute path. settings: JSON data by stage name. rebuilt: whether it was read
-    from the stages' folders, because `run.json` is missing or damaged."""
+    """photographs: absolute path. settings: JSON data by stage name."""
 
     photographs: Path | None = None
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)
-    rebuilt: bool = False
 
     @classmethod
     def read(cls, folder: Path) -> RunFile | None:
-        """The folder's `run.json`. If it is missing or damaged, it is rebuilt from the stages'
-        folders, without the place of the photographs. None if there is neither.
-
-        Raises SplatError as `read_sealed` does.
-        """
-        try:
-            data = read_sealed(folder / RUN_FILE)
-            if data is not None:
-                photographs, settings = data.get("photographs"), data.get("settings", {})
-                if not isinstance(photographs, str | None) or not isinstance(settings, dict):
-                    raise edited(folder / RUN_FILE)
-                return cls(Path(photographs) if photographs else None, settings)
-        except SplatError as error:
-            if error.code != EDITED or not (settings := settings_of_stages(folder)):
-                raise
-            return cls(settings=settings, rebuilt=True)
-        settings = settings_of_stages(folder)
-        return cls(settings=settings, rebuilt=True) if settings else None
+        """The folder's `run.json`: empty if it is missing beside folders of stages, None if there
+        are none either. Raises SplatError as `read_sealed` does."""
+        data = read_sealed(folder / RUN_FILE)
+        if data is None:
+            return cls() if holds_stages(folder) else None
+        photographs, settings = data.get("photographs"), data.get("settings", {})
+        if not isinstance(photographs, str | None) or not isinstance(settings, dict):
+            raise edited(folder / RUN_FILE)
+        return cls(Path(photographs) if photographs else None, settings)
 
     def write(self, folder: Path) -> None:
         """Write it atomically. Raises OSError."""
@@ -83,7 +71,7 @@ class RunFile:
 
 def holds_stages(folder: Path) -> bool:
     """Whether the folder holds a finished or unfinished stage of any version of splat."""
-    return any(_settings_in(name, path) is not None for name, path in _stage_files(folder))
+    return any(_is_of_stage(name, path) for name, path in _stage_files(folder))
 
 
 def stage_folder_around(place: Path) -> Path | None:
@@ -91,30 +79,9 @@ def stage_folder_around(place: Path) -> Path | None:
     place = place.resolve()
     for folder in (place, *place.parents):
         beside = _stage_files(folder.parent)
-        if any(p.parent == folder and _settings_in(n, p) is not None for n, p in beside):
+        if any(p.parent == folder and _is_of_stage(n, p) for n, p in beside):
             return folder
     return None
-
-
-def settings_of_stages(folder: Path) -> dict[str, dict[str, Any]]:
-    """Settings as JSON data by stage name. An unfinished attempt was requested after the stage had
-    finished: its settings replace those of the finished stage. Damaged files are left out.
-
-    Raises SplatError: run-folder-older, run-folder-newer, run-folder-unreadable.
-    """
-    found: dict[str, dict[str, Any]] = {}
-    for name, path in _stage_files(folder):
-        if (settings := _settings_in(name, path)) is None:
-            continue
-        try:
-            if path.name == MANIFEST:
-                read_sealed(path)
-        except SplatError as error:
-            if error.code != EDITED:
-                raise
-            continue
-        found[name] = {**found.get(name, {}), **settings}
-    return found
 
 
 def _stage_files(folder: Path) -> Iterator[tuple[str, Path]]:
@@ -124,10 +91,9 @@ def _stage_files(folder: Path) -> Iterator[tuple[str, Path]]:
             yield path.parent.name.removeprefix(".").removesuffix(".partial")[2:], path
 
 
-def _settings_in(name: str, path: Path) -> dict[str, Any] | None:
-    """The settings in a manifest or request of the stage `name`; None if it is not one."""
+def _is_of_stage(name: str, path: Path) -> bool:
+    """Whether a file is the manifest or request of the stage `name`."""
     with suppress(OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         data = json.loads(path.read_text(encoding="utf-8"))
-        fits = data.get("stage", name) == name and {"version", "inputs"} <= data.keys()
-        return dict(data["settings"]) if fits else None
-    return None
+        return bool(data.get("stage", name) == name and {"version", "inputs"} <= data.keys())
+    return False

@@ -449,7 +449,7 @@ def test_an_empty_value_takes_an_option_with_a_file_back(splat) -> None:
     assert started(splat("process", "--json")) == []
 
 
-def test_a_rebuilt_run_file_takes_the_default_preset_for_training(splat) -> None:
+def test_a_lost_run_file_means_the_default_preset(splat) -> None:
     splat("ingest", "photos")
     Path("run/run.json").unlink()
     assert "max splats 250,000" in splat("process", "photos").stderr
@@ -539,20 +539,12 @@ def test_option_out_of_two_run_folders_is_refused(splat) -> None:
     assert "--out" in result.stderr
 
 
-@pytest.mark.parametrize("text", [None, "{"])
-def test_run_folder_without_a_whole_run_file_is_continued_with_a_warning(
-    splat, tmp_path, text: str | None
-) -> None:
-    assert splat("process", "photos", "--out", "hill", "--steps", "70").exit_code == 0
-    run_file = tmp_path / "hill" / "run.json"
-    run_file.unlink() if text is None else run_file.write_text(text)
+def test_a_run_folder_without_its_run_file_is_continued_by_the_same_command(splat) -> None:
+    command = ("process", "photos", "--out", "hill", "--steps", "70")
+    assert splat(*command).exit_code == 0
+    Path("hill/run.json").unlink()
     assert splat("status", "hill").exit_code == 0
-    again = splat("process", "hill")
-    assert again.exit_code == 0, again.output
-    assert "rebuilt" in again.stderr
-    assert '"steps": 70' in run_file.read_text()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["hill", "photos"]
-    assert "rebuilt" not in splat("process", "hill").stderr
+    assert started(splat(*command, "--json")) == []
 
 
 def test_names_reach_the_terminal_without_control_characters(splat, pretend) -> None:

@@ -351,26 +351,32 @@ def test_files_of_others_survive_a_kill_at_every_rename(
     }
 
 
-@pytest.mark.parametrize("text", [None, "", "{", '{"schema": 2}'])
-def test_lost_or_damaged_run_file_is_rebuilt_from_the_stages(
-    photos: Path, run_folder: Path, text: str | None
+@pytest.mark.parametrize("text", ["", "{", '{"schema": 2}'])
+def test_a_damaged_run_file_is_refused(finished: Pipeline, run_folder: Path, text: str) -> None:
+    (run_folder / "run.json").write_text(text)
+    with pytest.raises(SplatError, match=r"delete .*run\.json.*give all options again") as caught:
+        finished.run()
+    assert caught.value.code == "manifest-edited"
+
+
+def test_a_run_without_its_run_file_goes_on_with_the_same_photographs_and_settings(
+    photos: Path, run_folder: Path
 ) -> None:
     settings = {"copy": CopySettings(upper=True), "count": CountSettings(iterations=5)}
     with pytest.raises(Interrupted):
         Pipeline(run_folder, photos, fake_stages(count=checkpointing(10, 6))).run(settings)
     run_file = run_folder / "run.json"
-    run_file.unlink() if text is None else run_file.write_text(text)
-    again = Pipeline(run_folder, stages=fake_stages(count=checkpointing(10, 6)))
+    run_file.unlink()
+    again = Pipeline(run_folder, photos, stages=fake_stages(count=checkpointing(10, 6)))
     assert is_run_folder(run_folder)
-    assert [step.reason for step in again.status()][:2] == ["", "was interrupted"]
+    assert [step.reason for step in again.plan(settings)][:2] == ["", "was interrupted"]
     heard = Heard()
-    again.run(listener=heard)
+    again.run(settings, listener=heard)
     assert heard.events == [("skipped", "copy"), ("resumed", "count"), ("started", "sign")]
     assert again.load("count") == "10 from 6"
     recorded = RunFile.read(run_folder)
     assert recorded is not None
     assert recorded.settings["copy"]["upper"] is True
-    assert ran(Pipeline(run_folder, photos, fake_stages())) == []
     run_file.unlink()
     other = photographs(run_folder.with_name("other"), z="zzz")
     with pytest.raises(SplatError) as caught:
