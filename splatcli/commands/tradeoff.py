@@ -19,7 +19,7 @@ from stages.prune.stage import pruner_of
 from stages.run import results
 from stages.run.pipeline import Pipeline
 from stages.scene import Splats, split_held_out
-from stages.tradeoff.measurement import TradeoffInputs, floater_views, measure_tradeoff
+from stages.tradeoff.measurement import TradeoffInputs, measure_tradeoff
 from stages.tradeoff.report import summarise, write_report
 
 
@@ -77,7 +77,6 @@ def _inputs(pipeline: Pipeline) -> TradeoffInputs:
         )
     manifest = pipeline.manifest("train")
     views = load_evaluation_views(reconstruction.folder, training, settings)
-    chosen = {view.name for view in floater_views(training, settings)}
     backend, report = results.backend_of_run(pipeline), Report()
     trained = pipeline.load("train")
     pruning = replace(pipeline.recorded_settings()["prune"], max_mb=0.0, min_psnr=0.0, seconds=0.0)
@@ -90,12 +89,10 @@ def _inputs(pipeline: Pipeline) -> TradeoffInputs:
 
     return TradeoffInputs(
         splats=splats,
-        training=[view for view in views if view.name in chosen],
         held_out=load_evaluation_views(reconstruction.folder, held, settings),
         views=reconstruction.views,
         units=reconstruction.units,
         backend=backend,
-        levelled=reconstruction.levelled,
         history=manifest.metrics.get("history", ()) if manifest else (),
         exported=tuple(results.exported_formats(pipeline)),
         quantised=pipeline.load("quantise"),

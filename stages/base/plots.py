@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 BLUE, ORANGE, GREY = "#1f5fa8", "#c8641e", "#777777"
-_SIZE_INCHES, _MAPS_INCHES, _DPI = (7.2, 4.0), (9.0, 4.9), 110
+_SIZE_INCHES, _DPI = (7.2, 4.0), 110
 
 
 def new_plot(title: str, x: str, y: str) -> tuple[Figure, Axes]:
@@ -28,18 +28,6 @@ def new_plot(title: str, x: str, y: str) -> tuple[Figure, Axes]:
     axes.grid(color="#dddddd", linewidth=0.6)
     axes.set_axisbelow(True)
     return figure, axes
-
-
-def new_maps(title: str, count: int) -> tuple[Figure, list[Axes]]:
-    """Empty maps, side by side: without ticks, and as long as wide."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=_MAPS_INCHES, dpi=_DPI, layout="constrained")
-    figure.suptitle(title, fontsize=11)
-    maps = list(figure.subplots(1, count))
-    for axes in maps:
-        axes.set(aspect="equal", xticks=[], yticks=[])
-    return figure, maps
 
 
 def write_plot(path: Path, figure: Figure) -> None:

@@ -1,4 +1,4 @@
-"""Capture coverage: which surfaces the photographs show, from which sides, and what they miss.
+"""Capture coverage: how many photographs show each surface, and over what angle.
 
 Splats are gathered into patches, the cubes of a grid. A view sees a patch if the area that it shows
 of it is at least a tenth of the area that the best view of that patch shows. So an occluded patch
@@ -7,7 +7,7 @@ is not seen, and a patch seen edge-on hardly is.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,16 +24,7 @@ MIN_ANGLE_DEG = 10.0  # between views: over less, depth is hardly measured
 PATCHES_ACROSS = 32  # along the diagonal of the middle nine tenths of what is seen
 MIN_PX = 2.0  # summed blend weight: a patch that covers less of a picture is not seen
 MIN_SHARE = 0.1  # of the area that the best view shows
-SUBJECT_SHARE = 0.5  # of the largest view count: patches seen so often are the subject
 _SIDE_PX = 240  # of the pictures that visibility is measured in
-INWARD_ELEVATIONS_DEG = (0.0, 80.0)  # where somebody may hold a camera around a subject
-OUTWARD_ELEVATIONS_DEG = (-50.0, 50.0)  # where cameras look outward
-MIN_GAP_DEG = 40.0  # to the nearest view
-_DIRECTIONS = 400
-_CONE_DEG = 15.0
-_BLOCKED_SHARE = 0.1  # of a cone's cross-section
-_WALL_SHARE, _BEHIND_SHARE = 0.3, 0.05  # of the area: on a wall, at least; behind it, at most
-_WALLS, _TRIED_PLANES = 3, 300
 
 
 @dataclass(frozen=True)
@@ -127,174 +118,12 @@ def weighted_quantile(
     return np.asarray(found)
 
 
-def _normalised(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.asarray(vectors / np.maximum(lengths, 1e-12))
-
-
 def _widest_deg(offsets: NDArray[np.float64]) -> float:
     """The largest angle between any two of the vectors [K, 3]; 0 for one."""
     if len(offsets) < 2:
         return 0.0
-    unit = _normalised(offsets)
+    unit = offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-12)
     return float(np.degrees(np.arccos(np.clip((unit @ unit.T).min(), -1.0, 1.0))))
-
-
-@dataclass(frozen=True)
-class CameraLayout:
-    """How the cameras of a capture are arranged.
-
-    Args:
-        inward: whether they look at a subject that they stand around; else they look outward.
-        middle: [3] of what they show.
-        directions: [V, 3] unit vectors: from the middle to each camera, or along its view where
-            they look outward.
-        up: [3] unit vector.
-        distance: of the median camera from the middle, world units.
-    """
-
-    inward: bool
-    middle: NDArray[np.float64]
-    directions: NDArray[np.float64]
-    up: NDArray[np.float64]
-    distance: float
-
-    def elevations_deg(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Angles of the directions [..., 3] above the horizon."""
-        return np.asarray(np.degrees(np.arcsin(np.clip(directions @ self.up, -1.0, 1.0))))
-
-    def azimuths_deg(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Angles of directions [..., 3] on the map, clockwise from its top; from -180 to 180."""
-        right, ahead = self.map_axes
-        return np.asarray(np.degrees(np.arctan2(directions @ right, directions @ ahead)))
-
-    @property
-    def map_axes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Two horizontal unit vectors [3]: to the right and up on a map seen from above."""
-        z = np.array([0.0, 0.0, 1.0])
-        ahead = z - (z @ self.up) * self.up
-        if np.linalg.norm(ahead) < 0.1:  # up is along z
-            ahead = np.array([0.0, 1.0, 0.0])
-            ahead = ahead - (ahead @ self.up) * self.up
-        ahead = _normalised(ahead)
-        return np.cross(ahead, self.up), ahead
-
-
-def camera_layout(cameras: Sequence[Camera], patches: Patches, levelled: bool) -> CameraLayout:
-    """levelled: whether up is -Y; else it is the mean of the cameras' own up directions."""
-    up = np.array([0.0, -1.0, 0.0])
-    if not levelled:
-        up = _normalised(-np.mean([camera.world_to_camera[1, :3] for camera in cameras], axis=0))
-    subject = patches.counts >= SUBJECT_SHARE * patches.counts.max()
-    middle = weighted_quantile(patches.centres[subject], patches.area[subject], 0.5)
-    eyes = np.array([camera.centre for camera in cameras])
-    inward = np.mean([_shows(camera, middle) for camera in cameras]) > 0.5
-    forward = np.array([camera.forward for camera in cameras])
-    distance = float(np.median(np.linalg.norm(eyes - middle, axis=1)))
-    directions = _normalised(eyes - middle) if inward else forward
-    return CameraLayout(bool(inward), middle, directions, up, distance)
-
-
-def _shows(camera: Camera, point: NDArray[np.float64]) -> bool:
-    pixels, z = camera.project(point[None])
-    return bool(z[0] > 0 and camera.shows(pixels)[0])
-
-
-@dataclass(frozen=True)
-class Gap:
-    """A direction that no view is near.
-
-    Args:
-        direction: [3] unit vector, as in `CameraLayout`.
-        angle_deg: to the nearest view.
-        nearest: index of that view.
-    """
-
-    direction: NDArray[np.float64]
-    angle_deg: float
-    nearest: int
-
-
-def find_gaps(
-    layout: CameraLayout, patches: Patches, cameras: Sequence[Camera], most: int = 3
-) -> tuple[Gap, ...]:
-    """The emptiest directions, largest gap first; each is found as if the gaps before it were
-    filled. Left out are directions where a surface is in the way, which are behind a wall, or where
-    nobody could hold a camera."""
-    tried = _sphere(_DIRECTIONS)
-    elevations = layout.elevations_deg(tried)
-    lowest, highest = INWARD_ELEVATIONS_DEG if layout.inward else OUTWARD_ELEVATIONS_DEG
-    tried = tried[(elevations >= lowest) & (elevations <= highest)]
-    if layout.inward:
-        tried = tried[[not _blocked(layout, patches, direction) for direction in tried]]
-        for normal, offset in _walls(patches, np.array([camera.centre for camera in cameras])):
-            places = layout.middle + layout.distance * tried
-            tried = tried[places @ normal > offset]
-    known, found = layout.directions, []
-    for _ in range(most):
-        if not len(tried):
-            break
-        closeness = np.clip(tried @ known.T, -1.0, 1.0)
-        emptiest = int(closeness.max(axis=1).argmin())
-        angle = float(np.degrees(np.arccos(closeness[emptiest].max())))
-        if angle < MIN_GAP_DEG:
-            break
-        views = closeness[emptiest, : len(layout.directions)]
-        found.append(Gap(tried[emptiest], angle, int(views.argmax())))
-        known = np.concatenate([known, tried[emptiest][None]])
-    return tuple(found)
-
-
-def _sphere(count: int) -> NDArray[np.float64]:
-    """[count, 3] directions, evenly spaced (Fibonacci lattice)."""
-    number = np.arange(count) + 0.5
-    y = 1 - 2 * number / count
-    turn = np.pi * (1 + 5**0.5) * number
-    across = np.sqrt(1 - y * y)
-    return np.stack([across * np.cos(turn), y, across * np.sin(turn)], axis=1)
-
-
-def _blocked(layout: CameraLayout, patches: Patches, direction: NDArray[np.float64]) -> bool:
-    """Whether a surface is between the middle and where a camera would be."""
-    offsets = patches.centres - layout.middle
-    along = offsets @ direction
-    beside = np.linalg.norm(offsets - along[:, None] * direction, axis=1)
-    cone = np.tan(np.radians(_CONE_DEG))
-    inside = (along > 0.5 * layout.distance) & (along < layout.distance) & (beside < cone * along)
-    cross_section = np.pi * (cone * layout.distance) ** 2
-    return bool(patches.area[inside].sum() > _BLOCKED_SHARE * cross_section)
-
-
-def _walls(
-    patches: Patches, eyes: NDArray[np.float64]
-) -> Iterator[tuple[NDArray[np.float64], float]]:
-    """(normal [3] towards the cameras, offset) of planes that are walls.
-
-    A wall holds much of the area and hides nearly none of it, and all cameras, with centres `eyes`
-    [V, 3], are in front of it. Planes through three random patches are tried (RANSAC).
-    """
-    total = patches.area / max(patches.area.sum(), 1e-12)
-    share = total
-    for number in range(_WALLS):
-        if share.sum() < _WALL_SHARE:
-            return
-        chances = share / share.sum()
-        draw = np.random.default_rng(number).choice(len(share), (_TRIED_PLANES, 3), p=chances)
-        a, b, c = patches.centres[draw].transpose(1, 0, 2)
-        normals = _normalised(np.cross(b - a, c - a))
-        offsets = (normals * a).sum(axis=1)
-        towards = np.sign(eyes.mean(axis=0) @ normals.T - offsets)
-        normals, offsets = normals * towards[:, None], offsets * towards
-        heights = patches.centres @ normals.T - offsets
-        on = np.abs(heights) < patches.side
-        fits = (eyes @ normals.T > offsets).all(axis=0)
-        fits &= total @ (heights < -patches.side) <= _BEHIND_SHARE
-        held = np.where(fits, share @ on, 0.0)
-        best = int(held.argmax())
-        if held[best] < _WALL_SHARE:
-            return
-        yield normals[best], float(offsets[best])
-        share = np.where(on[:, best], 0.0, share)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ the splats were trained at, drawn by the run's backend with the near plane of th
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,7 +25,6 @@ from stages.scene.pictures import load_image, mask_of, scaled_image, scaled_mask
 IN_MEMORY_MIB = 512  # of photographs; further ones are read from disk each time
 LARGEST_SUBSET = 24  # held-out views for what is too slow, or takes too much room, for all
 SIZES = {"full": 1.0, "half": 0.5, "quarter": 0.25}  # of the pictures, by name; each side's scale
-_TIMED_RUNS = 3
 ImageRenderer = Callable[[Camera], NDArray[np.floating]]  # a picture [H, W, 3]
 
 
@@ -298,29 +296,3 @@ def mean_psnr_db(
 def psnr_name(size: str, stem: str = "psnr") -> str:
     """The name of a metric at one of `SIZES`: psnr_db, psnr_half_db, psnr_quarter_db."""
     return f"{stem}_db" if size == "full" else f"{stem}_{size}_db"
-
-
-def seconds_per_frame(
-    splats: Splats,
-    cameras: Sequence[Camera],
-    backend: str,
-    clock: Callable[[], float] = time.perf_counter,
-) -> NDArray[np.float64]:
-    """[V] seconds that each camera's picture takes once kernels and buffers exist: the least of
-    three runs, which other work of the machine disturbs least.
-
-    Args:
-        splats: drawn by their own settings.
-        cameras: V of them.
-        backend: the rasteriser's name.
-        clock: wall-clock time, or `time.process_time` for the CPU time of all threads.
-    """
-    draw = image_renderer(splats, backend)
-    draw(cameras[0])
-    seconds = np.full(len(cameras), np.inf)
-    for _ in range(_TIMED_RUNS):
-        for i, camera in enumerate(cameras):
-            begun = clock()
-            draw(camera)
-            seconds[i] = min(seconds[i], clock() - begun)
-    return seconds

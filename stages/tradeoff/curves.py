@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from stages.evaluate.coverage import CameraLayout, Gap, Patches, PoorRegion
+from stages.evaluate.coverage import Patches
 from stages.evaluate.evaluation import Score
 from stages.scene import Camera
 from stages.tradeoff.bootstrap import Difference, paired_difference
@@ -37,7 +36,6 @@ class OperatingPoint:
         psnr_db: mean over the held-out views.
         change: of PSNR against the run's own splats.
         size_bytes: of the file; None where none was written.
-        draw_seconds: for one picture; None where it was not timed.
     """
 
     label: str
@@ -45,7 +43,6 @@ class OperatingPoint:
     psnr_db: float
     change: Difference
     size_bytes: int | None = None
-    draw_seconds: float | None = None
 
 
 @dataclass(frozen=True)
@@ -55,20 +52,11 @@ class Coverage:
     Args:
         names, cameras: of the training views that were examined, in the order of `patches`.
         patches: what they see.
-        layout: how they are arranged; None where they show no splat. Then there are no gaps and no
-            regions.
-        gaps: directions that no view is near.
-        regions: poorly covered ones.
-        floaters: [F, 3] means of the floaters.
     """
 
     names: tuple[str, ...]
     cameras: tuple[Camera, ...]
     patches: Patches
-    layout: CameraLayout | None
-    gaps: tuple[Gap, ...]
-    regions: tuple[PoorRegion, ...]
-    floaters: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -84,7 +72,6 @@ class Tradeoff:
         side_px: longer side of the pictures.
         coverage: what the training views show.
         exported: formats that the run wrote.
-        on_cpu: whether pictures were drawn, and so timed, on the CPU.
     """
 
     own: OperatingPoint
@@ -95,7 +82,6 @@ class Tradeoff:
     side_px: int
     coverage: Coverage
     exported: tuple[str, ...] = ()
-    on_cpu: bool = True
 
     @property
     def worst(self) -> Score:

@@ -3,30 +3,17 @@
 from __future__ import annotations
 
 import tempfile
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from stages import formats
-from stages.evaluate.contribution import measure_contributions
-from stages.evaluate.coverage import camera_layout, find_gaps, patches_of, poorly_covered_regions
-from stages.evaluate.evaluation import (
-    EvaluationView,
-    Score,
-    evaluate,
-    image_renderer,
-    seconds_per_frame,
-)
-from stages.evaluate.floaters import near_camera_floaters
+from stages.evaluate.coverage import patches_of
+from stages.evaluate.evaluation import EvaluationView, Score, evaluate, image_renderer
 from stages.formats.sog_quantisation import splats_to_write
 from stages.formats.values import drop_undrawable
-from stages.raster.backends import CPU, backend_of
-from stages.scene import DrawSettings, QuantisedSplats, Splats, View, evenly_spaced, split_held_out
+from stages.scene import QuantisedSplats, Splats, View, evenly_spaced, split_held_out
 from stages.tradeoff.curves import (
     Coverage,
     HistoryPoint,
@@ -38,9 +25,6 @@ from stages.tradeoff.curves import (
 
 # Of the run's splats: those that pruning to a given number is measured at.
 SHARES = (0.85, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1)
-# Training views, evenly spaced, that floaters are found by: as many as time allows, 24 at least.
-_FLOATER_PIXELS, _MIN_FLOATER_VIEWS = 24e6, 24
-TIMED_FRAMES = 4
 COVERAGE_VIEWS = 200  # at most, that coverage is measured by
 
 ProgressCallback = Callable[[str], None]
@@ -54,12 +38,10 @@ class TradeoffInputs:
 
     Args:
         splats: the run's last, in the coordinates of its cameras.
-        training: views that floaters are found by.
         held_out: views that quality is measured with.
         views: all views of the run.
         units: of lengths.
         backend: the rasteriser's name.
-        levelled: whether up is -Y.
         history: as training logged it.
         exported: formats that the run wrote.
         quantised: the precision that was chosen for files; None where none was.
@@ -68,21 +50,15 @@ class TradeoffInputs:
     """
 
     splats: Splats
-    training: Sequence[EvaluationView]
     held_out: Sequence[EvaluationView]
     views: tuple[View, ...]
     units: str
     backend: str
-    levelled: bool = True
     history: Sequence[dict[str, Any]] = ()
     exported: tuple[str, ...] = ()
     quantised: QuantisedSplats | None = None
     prune_to: PruneTo | None = None
     trained: Splats | None = None
-
-    @property
-    def on_cpu(self) -> bool:
-        return backend_of(self.backend).describe() == CPU
 
 
 def measure_tradeoff(inputs: TradeoffInputs, progress: ProgressCallback) -> Tradeoff:
@@ -91,18 +67,9 @@ def measure_tradeoff(inputs: TradeoffInputs, progress: ProgressCallback) -> Trad
     inputs = replace(inputs, splats=splats)
     progress("evaluating the run's splats")
     own_scores = _scores(inputs, splats)
-    own = _point(inputs, "as it is", splats, own_scores, own_scores)
-    progress("measuring the contribution of each splat")
-    contributions = measure_contributions(splats, inputs.training, inputs.backend)
+    own = _point("as it is", splats, own_scores, own_scores)
     progress("measuring the coverage of the capture")
-    cameras = [view.camera for view in inputs.training]
-    coverage = measure_coverage(
-        splats,
-        split_held_out(inputs.views)[0],
-        inputs.levelled,
-        near_camera_floaters(splats, contributions, cameras),
-        inputs.backend,
-    )
+    coverage = measure_coverage(splats, split_held_out(inputs.views)[0], inputs.backend)
     return Tradeoff(
         own=own,
         history=_history(inputs.history),
@@ -112,7 +79,6 @@ def measure_tradeoff(inputs: TradeoffInputs, progress: ProgressCallback) -> Trad
         side_px=max(max(view.pixels.shape[:2]) for view in inputs.held_out),
         coverage=coverage,
         exported=inputs.exported,
-        on_cpu=inputs.on_cpu,
     )
 
 
@@ -121,13 +87,9 @@ def _scores(inputs: TradeoffInputs, splats: Splats) -> list[Score]:
 
 
 def _point(
-    inputs: TradeoffInputs, label: str, splats: Splats, scores: list[Score], own: list[Score]
+    label: str, splats: Splats, scores: list[Score], own: list[Score], size: int | None = None
 ) -> OperatingPoint:
-    cameras = [view.camera for view in inputs.held_out[:TIMED_FRAMES]]
-    clock = time.process_time if inputs.on_cpu else time.perf_counter
-    seconds = float(np.median(seconds_per_frame(splats, cameras, inputs.backend, clock)))
-    change = psnr_change(scores, own)
-    return OperatingPoint(label, len(splats), mean_db(scores), change, draw_seconds=seconds)
+    return OperatingPoint(label, len(splats), mean_db(scores), psnr_change(scores, own), size)
 
 
 def _history(history: Sequence[dict[str, Any]]) -> tuple[HistoryPoint, ...]:
@@ -156,8 +118,7 @@ def _formats(
             for file in row.files(path):
                 file.unlink()
             scores = own if _identical(read, splats) else _scores(inputs, read)
-            change = psnr_change(scores, own)
-            points.append(OperatingPoint(f".{name}", len(read), mean_db(scores), change, size))
+            points.append(_point(f".{name}", read, scores, own, size))
     return tuple(sorted(points, key=lambda point: point.size_bytes or 0))
 
 
@@ -184,37 +145,13 @@ def _pruned(
             continue
         progress(f"keeping {share:.0%} of the splats")
         splats = inputs.prune_to(splats, count)
-        points.append(_point(inputs, f"{share:.0%}", splats, _scores(inputs, splats), own))
+        points.append(_point(f"{share:.0%}", splats, _scores(inputs, splats), own))
     return points
 
 
-def measure_coverage(
-    splats: Splats,
-    training: Sequence[View],
-    levelled: bool,
-    is_floater: NDArray[np.bool_],
-    backend: str,
-) -> Coverage:
-    """What the training views show of `splats`; is_floater [N]: which of these are floaters."""
+def measure_coverage(splats: Splats, training: Sequence[View], backend: str) -> Coverage:
+    """What the training views show of `splats`."""
     chosen = evenly_spaced(training, COVERAGE_VIEWS)
     cameras = tuple(splats.draw_settings.camera(view.camera) for view in chosen)
-    patches = patches_of(splats, cameras, backend)
-    layout = camera_layout(cameras, patches, levelled) if len(patches.centres) else None
-    return Coverage(
-        names=tuple(view.name for view in chosen),
-        cameras=cameras,
-        patches=patches,
-        layout=layout,
-        gaps=find_gaps(layout, patches, cameras) if layout else (),
-        regions=poorly_covered_regions(patches) if layout else (),
-        floaters=splats.means[is_floater].astype(np.float64),
-    )
-
-
-def floater_views(views: Sequence[View], draw_settings: DrawSettings) -> list[View]:
-    """The training views that floaters are found by."""
-    if not views:
-        return []
-    camera = draw_settings.camera(views[0].camera)
-    most = round(_FLOATER_PIXELS / (camera.width * camera.height))
-    return evenly_spaced(views, max(_MIN_FLOATER_VIEWS, most))
+    names = tuple(view.name for view in chosen)
+    return Coverage(names, cameras, patches_of(splats, cameras, backend))

@@ -17,14 +17,13 @@ from stages.tradeoff.plots import write_plots
 
 ERROR_GAIN = 4.0  # of the picture of errors, so that small ones can be seen
 _COLUMNS = (
-    *("curve", "label", "splats", "bytes", "wall_seconds", "cpu_seconds", "draw_seconds"),
+    *("curve", "label", "splats", "bytes", "wall_seconds", "cpu_seconds"),
     *("psnr_db", "change_db", "change_low_db", "change_high_db"),
 )
 _SECTIONS = {
     "time": ("Time", report_text.about_time),
     "formats": ("Bytes", report_text.about_formats),
     "splats": ("Splats", report_text.about_splats),
-    "drawing": ("Drawing", report_text.about_drawing),
     "coverage": ("Coverage", report_text.about_coverage),
     "photographs": ("Photographs", report_text.about_photographs),
 }
@@ -63,19 +62,19 @@ def write_report(folder: Path, name: str, tradeoff: Tradeoff, inputs: TradeoffIn
 def _rows(tradeoff: Tradeoff) -> Iterator[tuple[str, ...]]:
     for h in tradeoff.history:
         times = f"{h.seconds:.2f}", f"{h.cpu_seconds:.2f}"
-        row = (str(h.splats), "", *times, "", f"{h.psnr_db:.4f}")
+        row = (str(h.splats), "", *times, f"{h.psnr_db:.4f}")
         yield ("time", f"step {h.step}", *row, "", "", "")
     for curve, points in (("format", tradeoff.formats), ("splats", tradeoff.pruned)):
         for point in points:
             yield (curve, *_row(point))
     for score in tradeoff.scores:
-        yield ("photograph", score.name, *[""] * 5, f"{score.psnr_db:.4f}", "", "", "")
+        yield ("photograph", score.name, *[""] * 4, f"{score.psnr_db:.4f}", "", "", "")
 
 
 def _row(point: OperatingPoint) -> Iterator[str]:
     yield from (point.label, str(point.splats))
     yield "" if point.size_bytes is None else str(point.size_bytes)
-    yield from ("", "", "" if point.draw_seconds is None else f"{point.draw_seconds:.5f}")
+    yield from ("", "")
     change = point.change
     yield from (f"{x:.4f}" for x in (point.psnr_db, change.mean, change.low, change.high))
 

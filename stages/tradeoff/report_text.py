@@ -6,10 +6,14 @@ import math
 from pathlib import PurePosixPath
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stages.base.text import counted
-from stages.evaluate.coverage import MIN_ANGLE_DEG, MIN_VIEWS, CameraLayout, Gap, PoorRegion
+from stages.evaluate.coverage import (
+    MIN_ANGLE_DEG,
+    MIN_VIEWS,
+    PoorRegion,
+    poorly_covered_regions,
+)
 from stages.tradeoff.bootstrap import FEWEST_SHOWN, Difference
 from stages.tradeoff.curves import Coverage, OperatingPoint, Tradeoff, time_to
 
@@ -19,9 +23,6 @@ FINE_TUNED = (
     "The rest was fine-tuned after each removal, as `splat prune --max-splats` does. Training with "
     "so few splats from the start may lose less."
 )
-_OVERHEAD_DEG, _DOWN_DEG = 65.0, 25.0
-_SAME_AZIMUTH_DEG = 20.0
-_SAME_ELEVATION_DEG = 10.0
 _MIN_REGION_SHARE = 0.01  # of the area that is seen
 _POSITIONS = (
     ("upper left", "top", "upper right"),
@@ -95,17 +96,6 @@ def about_splats(tradeoff: Tradeoff) -> list[str]:
     return [*lines, FINE_TUNED]
 
 
-def about_drawing(tradeoff: Tradeoff) -> list[str]:
-    """How long a picture takes, and with how many splats it takes half as long."""
-    own, *fewer = tradeoff.pruned
-    kind = "of CPU time" if tradeoff.on_cpu else "on this GPU"
-    lines = [f"A picture of {tradeoff.side_px} pixels takes {_ms(own)} {kind}."]
-    half = [p for p in fewer if (p.draw_seconds or 0) <= (own.draw_seconds or 0) / 2]
-    if half:
-        lines.append(f"Half of that or less, {_ms(half[0])}: {_fewer(half[0], own)}.")
-    return lines
-
-
 def about_photographs(tradeoff: Tradeoff) -> list[str]:
     worst, count = tradeoff.worst, len(tradeoff.scores)
     lines = [
@@ -121,10 +111,10 @@ def about_photographs(tradeoff: Tradeoff) -> list[str]:
 
 
 def about_coverage(tradeoff: Tradeoff) -> list[str]:
-    """What the views show too little of, and where one more photograph would help most."""
+    """Which surfaces too few views show, or over too small an angle."""
     coverage = tradeoff.coverage
-    layout, patches = coverage.layout, coverage.patches
-    if layout is None:
+    patches = coverage.patches
+    if not len(patches.centres):
         return ["No training view shows any splat."]
     share = float(patches.area[patches.poorly_covered].sum() / patches.area.sum())
     lines = [
@@ -132,81 +122,22 @@ def about_coverage(tradeoff: Tradeoff) -> list[str]:
         f"than {MIN_VIEWS} of the {len(coverage.names)} training views, or over less than "
         f"{MIN_ANGLE_DEG:g}°. Half are seen by {counted(patches.median_count, 'view')} or more."
     ]
-    lines += [_gap(coverage, layout, number, gap) for number, gap in enumerate(coverage.gaps, 1)]
-    if not coverage.gaps:
-        lines.append("No direction that one could photograph from is far from every view.")
-    regions = [region for region in coverage.regions if region.share >= _MIN_REGION_SHARE]
-    lines += [_region(coverage, letter, r) for letter, r in zip("abc", regions, strict=False)]
-    return [*lines, _floaters(coverage)]
+    regions = poorly_covered_regions(patches)
+    return lines + [_region(coverage, r) for r in regions if r.share >= _MIN_REGION_SHARE]
 
 
-def describe_direction(
-    coverage: Coverage, layout: CameraLayout, direction: NDArray[np.float64]
-) -> str:
-    """A direction [3] around the middle by the photographs beside, around or opposite it."""
-    elevation = float(layout.elevations_deg(direction))
-    if layout.inward and elevation > _OVERHEAD_DEG:
-        return "straight above"
-    turns = (layout.azimuths_deg(layout.directions) - layout.azimuths_deg(direction)) % 360
-    after, before = int(turns.argmin()), int(turns.argmax())
-    away = min(float(turns[after]), 360 - float(turns[before]))
-    near = after if turns[after] <= 360 - turns[before] else before
-    hole = float(turns[after] + 360 - turns[before])
-    if away <= _SAME_AZIMUTH_DEG:
-        over = elevation - float(layout.elevations_deg(layout.directions[near]))
-        where = f"{'above' if over > 0 else 'below'} {_name(coverage, near)}"
-    elif hole <= 180:
-        where = f"between {_name(coverage, before)} and {_name(coverage, after)}"
-    else:
-        where = (
-            f"opposite {_name(coverage, int(np.abs(turns - 180).argmin()))}, in the {hole:.0f}° "
-            f"from {_name(coverage, before)} round to {_name(coverage, after)}"
-        )
-    if not layout.inward:
-        tilt = f", {abs(elevation):.0f}° {'up' if elevation > 0 else 'down'}"
-        return where + (tilt if abs(elevation) > _SAME_ELEVATION_DEG else "")
-    down = elevation > _DOWN_DEG
-    return where + (f", looking down {elevation:.0f}°" if down else ", held level")
-
-
-def _gap(coverage: Coverage, layout: CameraLayout, number: int, gap: Gap) -> str:
-    direction = describe_direction(coverage, layout, gap.direction)
-    missing = "sees the middle of the scene from there" if layout.inward else "looks there"
-    advice = "Take one from there, if possible." if layout.inward else "Turn there."
-    return (
-        f"Gap {number}, {direction}: no photograph {missing}; the nearest, "
-        f"{_name(coverage, gap.nearest)}, is {gap.angle_deg:.0f}° away. {advice}"
-    )
-
-
-def _region(coverage: Coverage, letter: str, region: PoorRegion) -> str:
+def _region(coverage: Coverage, region: PoorRegion) -> str:
     """Where a region is in the photograph that shows it best, and where to move from there."""
-    camera, name = coverage.cameras[region.best], _name(coverage, region.best)
+    camera, name = coverage.cameras[region.best], PurePosixPath(coverage.names[region.best]).stem
     pixels, _ = camera.project(region.centre[None])
     column, row = np.clip(3 * pixels[0] / (camera.width, camera.height), 0, 2).astype(int)
     seen = f"seen by {counted(region.views, 'view')}"
     if region.views > 1:
         seen += f", over {region.angle_deg:.0f}°"
     return (
-        f"Region {letter}, {_POSITIONS[row][column]} in {name}: {seen}; {region.share:.0%} of all. "
+        f"{_POSITIONS[row][column].capitalize()} in {name}: {seen}; {region.share:.0%} of all. "
         f"Photograph it from beside or above where {name} was taken, by a third of its distance."
     )
-
-
-def _floaters(coverage: Coverage) -> str:
-    if not len(coverage.floaters):
-        return "There are no floaters close to a camera."
-    eyes = np.array([camera.centre for camera in coverage.cameras])
-    nearest = np.linalg.norm(coverage.floaters[:, None] - eyes, axis=2).argmin(axis=1)
-    first, count = np.unique(nearest, return_counts=True)
-    order = np.argsort(-count, kind="stable")[:3]
-    named = ", ".join(f"{_name(coverage, int(first[i]))} ({count[i]})" for i in order)
-    many = counted(len(coverage.floaters), "splat is a floater", "splats are floaters")
-    return f"{many} close to a camera, most of them near {named}."
-
-
-def _name(coverage: Coverage, number: int) -> str:
-    return PurePosixPath(coverage.names[number]).stem
 
 
 def costs(change: Difference) -> str:
@@ -235,7 +166,3 @@ def _between(ends: tuple[float, float]) -> str:
 
 def _seconds(count: float) -> str:
     return f"{count:.1f} s" if count < 120 else f"{count / 60:.1f} min"
-
-
-def _ms(point: OperatingPoint) -> str:
-    return f"{1000 * (point.draw_seconds or 0):.0f} ms"

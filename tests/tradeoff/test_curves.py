@@ -70,7 +70,7 @@ def empty_coverage() -> Coverage:
     """A capture that shows nothing."""
     none = np.zeros(0)
     patches = Patches(np.zeros((0, 3)), 1.0, none, np.zeros((0, 1), bool), none.astype(int), none)
-    return Coverage((), (), patches, None, (), (), np.zeros((0, 3)))
+    return Coverage((), (), patches)
 
 
 @pytest.mark.parametrize("logged", [0, 1])

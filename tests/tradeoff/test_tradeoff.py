@@ -16,11 +16,9 @@ from stages.formats import FORMATS
 from stages.prune.settings import PruneSettings
 from stages.prune.stage import pruner_of
 from stages.scene import (
-    Camera,
     DrawSettings,
     QuantisedSplats,
     TrainedSplats,
-    View,
     evenly_spaced,
     split_held_out,
 )
@@ -33,12 +31,7 @@ from stages.tradeoff.comparison import (
     verdict_lines,
     write_comparison,
 )
-from stages.tradeoff.measurement import (
-    SHARES,
-    TradeoffInputs,
-    floater_views,
-    measure_tradeoff,
-)
+from stages.tradeoff.measurement import SHARES, TradeoffInputs, measure_tradeoff
 from stages.tradeoff.report import write_report
 from tests.small_scene import small_scene
 
@@ -72,12 +65,10 @@ def inputs(scene):
 
     return TradeoffInputs(
         splats,
-        training,
         held,
         reconstruction.views,
         "metres",
         "cpu",
-        True,
         COURSE,
         ("ply", "spz"),
         prune_to=prune_to,
@@ -163,7 +154,7 @@ def test_the_report_is_one_file_that_needs_no_other(tradeoff, inputs, tmp_path) 
     files = write_report(tmp_path, "<scene>", tradeoff, inputs)
     assert {file.name for file in files} == {
         *("report.html", "tradeoff.csv"),
-        *(f"{n}.png" for n in ("time", "splats", "drawing", "coverage")),
+        *(f"{n}.png" for n in ("time", "splats")),
     }
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert not re.findall(r"(?:src|href)=\"(?!data:)", text)
@@ -172,7 +163,6 @@ def test_the_report_is_one_file_that_needs_no_other(tradeoff, inputs, tmp_path) 
     assert report_text.FINE_TUNED in text
     assert tradeoff.worst.name in text
     assert "<h2>Coverage</h2>" in text
-    assert "Gap 1, straight above" in text  # ten cameras in a ring
 
 
 def test_the_table_holds_every_point(tradeoff, inputs, tmp_path) -> None:
@@ -192,16 +182,8 @@ def test_plots_have_axes_with_units_and_legends(tradeoff, inputs, tmp_path, monk
     shown = {}
     monkeypatch.setattr(plots, "write_plot", lambda path, figure: shown.update({path.stem: figure}))
     plots.write_plots(tmp_path, tradeoff)
-    maps = shown.pop("coverage")
-    bars = [axes.get_xlabel() for axes in maps.axes if axes.get_xlabel()]
-    assert bars == ["views that see it", "angle between views (°)"]
-    assert maps.legends
     labels = {name: figure.axes[0].get_xlabel() for name, figure in shown.items()}
-    assert labels == {
-        "time": "CPU time of all threads (s)",
-        "splats": "splats",
-        "drawing": "CPU time of a picture (ms)",
-    }
+    assert labels == {"time": "CPU time of all threads (s)", "splats": "splats"}
     for figure in shown.values():
         assert figure.axes[0].get_ylabel() == "held-out PSNR (dB)"
         assert figure.axes[0].get_legend() is not None
@@ -297,17 +279,3 @@ def test_the_comparison_shows_every_held_out_view_three_times(scene, tmp_path) -
 def test_a_few_views_are_evenly_spaced() -> None:
     assert evenly_spaced(range(10), 5) == [0, 2, 4, 6, 8]
     assert evenly_spaced(range(3), 24) == [0, 1, 2]
-
-
-def test_all_training_views_decide_where_time_allows() -> None:
-    views = [View(str(i), "", camera(800, 600)) for i in range(60)]
-    assert len(floater_views(views, DrawSettings(side=480))) == 60
-    assert len(floater_views(views, DrawSettings(side=800))) == 50
-    assert (
-        len(floater_views([replace(v, camera=camera(8000, 6000)) for v in views], DrawSettings()))
-        == 24
-    )
-
-
-def camera(width: int, height: int) -> Camera:
-    return Camera(width, height, 1.0, 1.0, 0.0, 0.0, np.eye(4))
