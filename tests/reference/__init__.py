@@ -1,4 +1,5 @@
-"""The definition as a backend for tests: 300 times slower than the CPU's.
+"""What backends are held to: the definition of a picture (`definition`), as a backend of its own
+(`rasteriser`, 300 times slower than the CPU's) and as a training step (`step`).
 
 Importing this package adds it to the lists of backends and of training steps.
 """

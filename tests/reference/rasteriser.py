@@ -25,7 +25,8 @@ from stages.raster.definition import (
     gradient_columns,
     with_smoothing,
 )
-from stages.raster.reference import (
+from stages.scene import Camera
+from tests.reference.definition import (
     Parameters,
     Projected,
     alphas_at,
@@ -37,7 +38,6 @@ from stages.raster.reference import (
     render_projected,
     weights_of,
 )
-from stages.scene import Camera
 
 _LARGEST = float(np.finfo(np.float32).max)
 
