@@ -13,22 +13,20 @@ from stages.evaluate.verdict import GOOD, UNKNOWN, USABLE, WRONG
 from stages.run.manifest import Manifest
 from stages.run.pipeline import Pipeline
 
-_HEADINGS = {
-    "psnr_db": "held_out_psnr_db",
-    "psnr_half_db": "half_size_db",
-    "psnr_quarter_db": "quarter_size_db",
-}
-# The metrics in the tables of `process` and `status`, by stage.
+# The metrics in the tables of `process` and `status`, by stage; those of `show_quality` apart.
 _HEADLINES = {
     "ingest": ("photographs", "left_out"),
     "sfm": ("registered_images", "points", "mean_reprojection_error_px"),
     "seed": ("splats",),
-    "train": ("splats", "psnr_db", "psnr_half_db", "psnr_quarter_db", "ssim", "trained_by"),
+    "train": ("splats", "trained_by"),
     # Later stages measure at sizes of their own: it cannot be compared with that of training.
     "prune": ("splats", "floaters_removed", "psnr_change_db"),
     "quantise": ("sh_degree", "kept_mib"),
     "export": ("files", "splats"),
 }
+_SMALLER = {"mean at half size": "psnr_half_db", "mean at quarter size": "psnr_quarter_db"}
+_SCALE = """To an eye: 20 dB is blurred, 25 dB is softer, 30 dB is hardly told apart.
+More of PSNR and SSIM: docs/guide/captures.md#psnr-and-ssim"""
 _STYLES = {GOOD: "green", USABLE: "yellow", WRONG: "red", UNKNOWN: ""}
 
 
@@ -54,6 +52,8 @@ def show(pipeline: Pipeline, until: str | None) -> None:
     peak_mib = max((m.peak_memory_mib for m in manifests), default=0.0)
     rows.append(("all", console.duration(total_s), memory(peak_mib), ""))
     console.table(("stage", "time", "peak memory", "result"), rows)
+    for manifest in manifests:
+        show_quality(manifest)
     if assets:
         console.out.print()
         console.columns(
@@ -100,10 +100,26 @@ def headline(manifest: Manifest) -> str:
     """The most important metrics of one stage."""
     names = _HEADLINES.get(manifest.stage, ())
     chosen = {n: manifest.metrics[n] for n in names if n in manifest.metrics}
-    if manifest.stage == "train":
-        chosen = {_HEADINGS.get(n, n): v for n, v in chosen.items()}
     counts = {n: len(v) if isinstance(v, (list, dict)) else v for n, v in chosen.items()}
     return console.figures(counts)
+
+
+def show_quality(manifest: Manifest) -> None:
+    """Print PSNR and SSIM of held-out photographs, and what they mean; nothing where the stage
+    has no such metrics."""
+    metrics = manifest.metrics
+    if manifest.stage != "train" or "psnr_db" not in metrics:
+        return
+    worst = f"worst: {metrics.get('psnr_worst_view')}"
+    names = {"mean": "psnr_db", **_SMALLER, worst: "psnr_worst_db"}
+    rows = [
+        (name, console.figure(key, metrics[key]), str(metrics.get("ssim", "")) if i == 0 else "")
+        for i, (name, key) in enumerate(names.items())
+        if key in metrics
+    ]
+    console.out.print()
+    console.table(("held-out photographs", "PSNR", "SSIM"), rows)
+    console.out.print(_SCALE)
 
 
 def _assets(pipeline: Pipeline) -> list[tuple[str, int, str]]:

@@ -18,7 +18,7 @@ from stages.base import threads
 from stages.base.distribution import NAME, VERSION, install_command
 from stages.base.errors import Family
 from stages.base.libraries import modules_of, needed, versions
-from stages.base.memory import available_mib
+from stages.base.memory import MIB, available_mib
 from stages.base.text import counted, reason_of
 from stages.ingest.decode import FORMATS, readers_set_up
 from stages.raster.backends import AUTO, BACKENDS, Backend, backend_of
@@ -93,7 +93,7 @@ def _memory() -> Check:
     free = available_mib()
     enough = free >= _LITTLE_MEMORY_MIB
     advice = "" if enough else "Little: use --preset preview and a smaller --train-side."
-    return Check("free memory", f"{free:,.0f} MiB", advice=advice)
+    return Check("free memory", console.size(free * MIB), advice=advice)
 
 
 def _disk() -> Check:

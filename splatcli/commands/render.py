@@ -101,13 +101,13 @@ def _resized(camera: Camera, width: int | None) -> Camera:
 
 
 def _check_memory(camera: Camera) -> None:
-    free = memory.available_mib()
-    needed = camera.width * camera.height * _BYTES_PER_PIXEL / memory.MIB
+    free = memory.available_mib() * memory.MIB
+    needed = camera.width * camera.height * _BYTES_PER_PIXEL
     if needed > free:
         raise ResourceError(
             "render-too-large",
-            given=f"A picture of {camera.width} x {camera.height} takes about {needed:,.0f} MiB.",
-            wanted=f"At most the {free:,.0f} MiB that are free.",
+            given=f"A picture of {camera.width} x {camera.height} takes {console.size(needed)}.",
+            wanted=f"At most the {console.size(free)} that are free.",
             hint="Choose a smaller --width.",
         )
 

@@ -57,6 +57,9 @@ def _print(pipeline: Pipeline, steps: list[Step], busy: int | None) -> None:
         ],
         title=str(pipeline.run_folder),
     )
+    for step in steps:
+        if step.manifest and not step.will_run:
+            run_result.show_quality(step.manifest)
     if busy:
         console.out.print(f"\nProcess {busy} is working on it now.")
 

@@ -53,7 +53,7 @@ def test_process_writes_every_asset_and_prints_the_paths(splat) -> None:
     assert result.exit_code == 0, result.output
     assert str(Path("run/7-export/out.ply")) in result.stdout
     assert "peak memory" in result.stdout
-    assert "held out PSNR 27.12 dB" in " ".join(result.stdout.split())
+    assert "mean 27.12 dB" in " ".join(result.stdout.split())
     assert "Do it yourself" in result.stderr
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -35,6 +36,8 @@ def shown(capsys: pytest.CaptureFixture[str], verdict: dict[str, str]) -> str:
         )
         for name, values in metrics.items()
     }
+    metrics["train"] |= {"psnr_db": 27.107, "psnr_half_db": 27.494, "ssim": 0.8776}
+    metrics["train"] |= {"psnr_worst_db": 23.116, "psnr_worst_view": "IMG_0017.jpg"}
     pipeline: Any = SimpleNamespace(
         layout=SimpleNamespace(up_to=lambda until: [SimpleNamespace(name=n) for n in manifests]),
         manifest=manifests.get,
@@ -57,6 +60,22 @@ def test_memory_is_in_the_unit_of_the_files(capsys: pytest.CaptureFixture[str]) 
     out = shown(capsys, {"grade": "good", "text": "Good."})
     assert "105 MB" in out or "104.9 MB" in out
     assert "MiB" not in out
+
+
+def test_psnr_and_ssim_have_a_scale_and_a_page_of_the_guide(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    stages, _, quality = shown(capsys, {"grade": "good", "text": "Good."}).partition("held-out")
+    assert "PSNR" not in stages
+    rows = [line.split() for line in quality.splitlines()]
+    assert ["mean", "27.11", "dB", "0.8776"] in rows
+    assert ["worst:", "IMG_0017.jpg", "23.12", "dB"] in rows
+    assert "To an eye: 20 dB" in quality
+    (page,) = re.findall(r"docs/guide/\S+", quality)
+    file, _, anchor = page.partition("#")
+    text = (Path(__file__).parents[2] / file).read_text(encoding="utf-8")
+    assert anchor in re.sub(r"[^\w# \n]", "", text.lower()).replace(" ", "-")
+    assert max(map(len, quality.splitlines())) <= 80
 
 
 def test_quiet_runs_tell_only_of_a_wrong_result(
