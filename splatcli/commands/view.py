@@ -20,13 +20,14 @@ from splatcli.options import number
 from stages.base import interrupt, scratch
 from stages.base.atomic import partial_prefix, remove_abandoned_files
 from stages.base.errors import SplatError, UsageError
+from stages.editing.regions import parse_numbers
 from stages.formats import format_of, html, ply
 from stages.formats.values import drop_undrawable
 from stages.run import results
 from stages.run.pipeline import Pipeline
 from stages.scene import Splats
 from stages.viewer.render_cameras import camera_of_view
-from stages.viewer.server import Item, LocalServer, open_in_browser
+from stages.viewer.server import Item, LocalServer, Response, open_in_browser
 from stages.viewer.site import site
 
 
@@ -82,7 +83,7 @@ def view(
             _serve(server, count, open_browser)
 
 
-def _server(items: dict[str, Item], port: int) -> LocalServer:
+def _server(items: dict[str, Item | Response], port: int) -> LocalServer:
     try:
         return LocalServer(items, port)
     except OSError as error:
@@ -132,7 +133,7 @@ def _save(
 
 def _items(
     target: Path | None, pipeline: Pipeline | None, splats: Splats, content: Path
-) -> dict[str, Item]:
+) -> dict[str, Item | Response]:
     """The items to serve. The splats are written to `content` as .ply, which the page reads best;
     a streamed asset is served as it is."""
     run = pipeline or results.run_around(target)
@@ -144,7 +145,24 @@ def _items(
         ply.write(content, splats, units=units)
     views, photos = (sfm.views, sfm.folder) if sfm else ((), None)
     source = str(pipeline.run_folder if pipeline is not None else target)
-    return site(_title(target, pipeline), splats, content, views, photos, units, source)
+    items = site(_title(target, pipeline), splats, content, views, photos, units, source)
+    return {**items, "/point": _print_point}
+
+
+def _print_point(query: dict[str, str]) -> Item:
+    """Print where the page was clicked, and the box around all clicks as options of other commands.
+    query: "at", three numbers, and perhaps "box", six."""
+    at, box = parse_numbers(query["at"], 3), parse_numbers(query.get("box", "0,0,0,0,0,0"), 6)
+    if at is None or box is None:
+        raise ValueError("wanted numbers")
+    point, ends = at.tolist(), box.tolist() if "box" in query else None
+    if console.mode.as_json:
+        console.emit("point", at=point, box=ends)
+        return Item(b"", "text/plain")
+    console.out.print("x,y,z = {:g},{:g},{:g}".format(*point))
+    if ends:
+        console.out.print("  --crop box:{:g},{:g},{:g},{:g},{:g},{:g}".format(*ends))
+    return Item(b"", "text/plain")
 
 
 def _title(target: Path | None, pipeline: Pipeline | None) -> str:

@@ -38,7 +38,7 @@ class ExportSettings:
 
 STAGE = Stage(
     "export",
-    version=13,
+    version=14,
     reads=("sfm", "quantise"),
     settings_type=ExportSettings,
     adds="formats",

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import urllib.error
 import urllib.request
 import webbrowser
 from pathlib import Path
@@ -51,8 +52,15 @@ def test_a_file_is_served_until_ctrl_c(tmp_path: Path, suffix: str, stop: signal
         assert re.fullmatch(r"http://127\.0\.0\.1:\d+/[\w-]{22}/", address)
         page = urllib.request.urlopen(address, timeout=20).read().decode()
         content = urllib.request.urlopen(address + "scene.ply", timeout=20).read()
+        point = address + "point?at=1,-2.5,3&box=0,-2.5,0,1,2,3"
+        urllib.request.urlopen(point, timeout=20)
+        printed = [line_of(it).strip() for _ in range(2)]
+        for wrong in ("", "?at=1,2", "?at=1,2,nan", "?at=1,2,3&box=1"):
+            with pytest.raises(urllib.error.HTTPError):
+                urllib.request.urlopen(address + "point" + wrong, timeout=20)
         it.send_signal(stop)
         assert it.wait(timeout=20) == 0
+    assert printed == ["x,y,z = 1,-2.5,3", "--crop box:0,-2.5,0,1,2,3"]
     said = errors.read_text()
     assert f"<title>thing.{suffix}</title>" in page
     assert '"count": 7' in page

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import shlex
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,11 @@ from typer.testing import CliRunner
 
 from splatcli.app import app
 from stages import formats
+from stages.formats import ply
+from stages.scene import View
+from stages.viewer.server import Item, LocalServer
+from stages.viewer.site import site
+from tests import scenes
 from tests.formats.truth import many_splats
 from tests.viewer.browser import Browser
 from tests.viewer.screenshots import SIZE
@@ -160,3 +166,48 @@ def test_looking_around_selects_nothing(browser: Browser, tmp_path: Path) -> Non
     assert "2,000 left" in browser.run("document.getElementById('chosen').textContent")
     assert browser.run("document.getElementById('keep').disabled")
     browser.resize(SIZE)
+
+
+def click(browser: Browser, x: float, y: float) -> None:
+    for kind in ("mousePressed", "mouseReleased"):
+        browser.call(
+            *("Input.dispatchMouseEvent",), type=kind, x=x, y=y, button="left", clickCount=1
+        )
+
+
+@pytest.mark.slow
+def test_a_click_names_the_place_and_several_make_a_box(browser: Browser, tmp_path: Path) -> None:
+    camera = scenes.camera(900, 700, focal=700.0)
+    x, y = np.meshgrid(np.arange(-2.5, 2.6, 0.1), np.arange(-2.0, 2.1, 0.1))
+    wall = scenes.splats(np.stack([x, y, 4 + 0.1 * x], -1).reshape(-1, 3), 0.1, 0.9)
+    scene = scenes.join(wall, scenes.splats([[0, 0, 1.0]], 0.1, 0.1), wall.take(slice(0, 1)))
+    ply.write(tmp_path / "scene.ply", scene)
+    asked: list[dict[str, str]] = []
+
+    def record(query: dict[str, str]) -> Item:
+        asked.append(query)
+        return Item(b"", "text/plain")
+
+    items = site("wall", scene, tmp_path / "scene.ply", (View("a.jpg", "", camera),))
+    with LocalServer({**items, "/point": record}) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        browser.resize((900, 700))
+        browser.open(server.address + "?webgl")
+        browser.run("window.splatReady")
+        browser.run("document.getElementById('select').open = true")
+        browser.run(
+            "(tool => { tool.value = 'points'; tool.onchange(); })(document.getElementById('tool'))"
+        )
+        places = [(0.0, 0.0, 4.0), (1.0, -0.5, 4.1), (0.5, 1.2, 4.05)]
+        for place in places:
+            (pixel,), _ = camera.project(np.array([place]))
+            click(browser, *pixel.tolist())
+        browser.run("new Promise(done => setTimeout(done, 300))")
+        shown = browser.run("document.getElementById('chosen').textContent")
+        server.shutdown()
+    assert shown.startswith("0.5,1.2,4.05: ")
+    found = [tuple(map(float, query["at"].split(","))) for query in asked]
+    np.testing.assert_allclose(found, places, atol=1e-3)
+    assert [query.get("box") for query in asked[:2]] == [None, "0,-0.5,4,1,0,4.1"]
+    assert asked[2]["box"] == "0,-0.5,4,1,1.2,4.1"
+    assert not browser.run("document.getElementById('keep').disabled")

@@ -4,6 +4,7 @@
 const CORNER_PX = 4; // between neighbouring corners of a lasso, at least
 const DOTS = 200000; // of what is selected, at most
 const ENDS = ["x from", "y from", "z from", "x to", "y to", "z to"];
+const REACH_PX = [4, 8, 16, 32]; // around a click, until what lies there covers what is behind it
 const EDGES = [[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]];
 
 const rounded = (value) => Number(value.toPrecision(9));
@@ -11,6 +12,7 @@ const rounded = (value) => Number(value.toPrecision(9));
 function boxOf(ends) {
     const [x0, y0, z0, x1, y1, z1] = ends;
     return {
+        ends,
         text: `box:${ends.join(",")}`,
         holds: (x, y, z) => x >= x0 && x <= x1 && y >= y0 && y <= y1 && z >= z0 && z <= z1
     };
@@ -35,6 +37,15 @@ function lassoOf(view, corners) {
         return inside;
     };
     return { text: `lasso:${[...view, ...corners.flat()].join(",")}`, holds };
+}
+
+// Of a float of 16 bits from 0 to 1.
+const fromHalf = (bits) => 2 ** ((bits >> 10) - 15) * (1 + (bits & 1023) / 1024);
+
+// The box around points.
+function boxAround(points) {
+    const ends = (choose) => [0, 1, 2].map((axis) => choose(...points.map((at) => at[axis])));
+    return boxOf([...ends(Math.min), ...ends(Math.max)]);
 }
 
 function viewOf(app) {
@@ -104,11 +115,17 @@ class Selection {
         this.chain = [];
         this.region = null;
         this.corners = [];
+        this.points = [];
+        const { min, max } = scene.bounds;
+        const size = Math.max(...max.map((end, axis) => end - min[axis])) || 1;
+        this.digits = Math.min(Math.max(4 - Math.floor(Math.log10(size)), 0), 20); // of coordinates
+        if (!this.centres) find("tool").querySelector("option:last-child").remove();
         this.canvas = find("view").appendChild(document.createElement("canvas"));
         this.canvas.id = "overlay";
         this.canvas.onpointerdown = (event) => this.begin(event);
         this.canvas.onpointermove = (event) => event.buttons && this.draw(event);
         this.canvas.onpointerup = () => this.end();
+        this.listen(app.graphicsDevice.canvas);
         find("tool").onchange = () => this.choose();
         find("keep").onclick = () => this.add("crop");
         find("drop").onclick = () => this.add("drop");
@@ -123,6 +140,18 @@ class Selection {
         app.on("frameend", () => this.paint());
         find("select").hidden = false;
         this.update();
+    }
+
+    // A click on the scene, which is no drag, is a point.
+    listen(canvas) {
+        let pressed = [0, 0];
+        const listener = ({ type, offsetX, offsetY }) => {
+            if (type === "pointerdown") pressed = [offsetX, offsetY];
+            else if (Math.hypot(offsetX - pressed[0], offsetY - pressed[1]) < CORNER_PX) {
+                if (find("tool").value === "points") this.point(offsetX, offsetY);
+            }
+        };
+        for (const type of ["pointerdown", "pointerup"]) canvas.addEventListener(type, listener, true);
     }
 
     makeSliders() {
@@ -141,6 +170,7 @@ class Selection {
         find("box").hidden = tool !== "box";
         this.canvas.style.pointerEvents = tool === "lasso" ? "auto" : "none";
         this.corners = [];
+        this.points = [];
         this.region = tool === "box" ? boxOf(this.ends()) : null;
         this.update();
     }
@@ -167,6 +197,37 @@ class Selection {
         this.region = this.corners.length > 2 ? lassoOf(viewOf(this.app), this.corners) : null;
         this.corners = [];
         this.update();
+    }
+
+    // Name the place of the scene at a pixel; two and more make a box.
+    point(x, y) {
+        const at = this.placeAt(x, y);
+        if (!at) return;
+        this.points.push(at);
+        this.region = this.points.length > 1 ? boxAround(this.points) : null;
+        this.update();
+        const box = this.region ? `&box=${this.region.ends}` : "";
+        if (this.scene.content) fetch(`point?at=${at}${box}`); // `splat view` prints it
+    }
+
+    // The splat that covers half of what is behind it, from there.
+    placeAt(x, y) {
+        const view = viewOf(this.app);
+        for (const reach of REACH_PX) {
+            const near = [];
+            for (let i = 0; i < this.centres.length; i += 3) {
+                const at = this.centres.subarray(i, i + 3);
+                const pixel = seenBy(view, ...at);
+                if (!pixel || Math.hypot(pixel[0] - x, pixel[1] - y) > reach) continue;
+                if (this.left(...at)) near.push([view[8] * at[0] + view[9] * at[1] + view[10] * at[2], i]);
+            }
+            let behind = 1;
+            for (const [, i] of near.sort((a, b) => a[0] - b[0])) {
+                behind *= 1 - fromHalf(this.colours.alphas[i / 3]);
+                if (behind < 0.5) return [...this.centres.subarray(i, i + 3)].map((v) => Number(v.toFixed(this.digits)));
+            }
+        }
+        return null;
     }
 
     add(word) {
@@ -198,7 +259,8 @@ class Selection {
         }
         const count = (n) => n.toLocaleString("en");
         const summary = this.region ? `${count(this.chosen.length)} of ${count(left)} selected` : `${count(left)} left`;
-        find("chosen").textContent = this.centres ? summary : "";
+        const last = this.points.length ? `${this.points.at(-1).join(",")}: ` : "";
+        find("chosen").textContent = this.centres ? last + summary : "";
         const some = this.region && (this.chosen.length || !this.centres);
         for (const name of ["keep", "drop"]) find(name).disabled = !some;
         for (const name of ["undo", "save", "copy"]) find(name).disabled = !this.chain.length;
@@ -229,7 +291,7 @@ class Selection {
         if (canvas.height !== height) canvas.height = height;
         const pen = canvas.getContext("2d");
         pen.clearRect(0, 0, width, height);
-        const nothing = !this.region && !this.corners.length;
+        const nothing = !this.region && !this.corners.length && !this.points.length;
         canvas.style.opacity = nothing ? 0 : 1; // Chromium may go on showing what was cleared
         if (nothing) return;
         const view = viewOf(this.app);
@@ -240,11 +302,13 @@ class Selection {
             if (at) pen.fillRect(at[0] - 1, at[1] - 1, 2, 2);
         }
         this.paintLines(pen, [...this.corners.map((to, i) => [this.corners.at(i - 1), to])]);
-        if (find("tool").value === "box") this.paintLines(pen, this.edges(view));
+        for (const at of this.points.map((point) => seenBy(view, ...point))) {
+            if (at) pen.fillRect(at[0] - 3, at[1] - 3, 7, 7);
+        }
+        if (this.region && this.region.ends) this.paintLines(pen, this.edges(view, this.region.ends));
     }
 
-    edges(view) {
-        const ends = this.ends();
+    edges(view, ends) {
         const corner = (i) => seenBy(view, ends[i & 1 ? 3 : 0], ends[i & 2 ? 4 : 1], ends[i & 4 ? 5 : 2]);
         return EDGES.map((pair) => pair.map(corner)).filter(([a, b]) => a && b);
     }
