@@ -1,4 +1,4 @@
-"""A condition is read by a few rules, and nothing else is ever run."""
+"""A condition is comparisons joined by "and", and nothing else is ever run."""
 
 from __future__ import annotations
 
@@ -22,15 +22,10 @@ SPLATS = scenes.splats(
     [
         ("opacity > 0.1", [False, True, True]),
         ("opacity > 0.1 and scale < 1.5", [False, True, False]),
-        ("not opacity > 0.1 or thickness < 0.05", [True, False, True]),
-        ("-1 <= x < 1", [True, False, True]),
-        ("x * x + y * y + z * z < 4 * 4", [True, True, False]),
+        ("thickness<.05", [False, False, True]),
+        ("x >= -1 and x < 1 and z <= 4", [True, False, False]),
         ("red > 0.9", [True, False, False]),
-        ("green - blue > 0.5", [False, True, False]),
-        ("degree == 0", [True, True, True]),
-        ("1 / 0 > x", [True, True, True]),
-        ("x / 0 == x / 0", [False, True, True]),  # 0 / 0 is no number, and equals none
-        ("True and z != 3", [True, False, True]),
+        ("degree == 0 and z != 3e0", [True, False, True]),
     ],
 )
 def test_a_condition_says_which_splats_stay(text: str, wanted: list[bool]) -> None:
@@ -42,27 +37,17 @@ def test_a_condition_says_which_splats_stay(text: str, wanted: list[bool]) -> No
     [
         "",
         "opacity",
-        "x + 1",
         "opacity >",
-        "opacity.real > 1",
+        "opacity > 0.1 and",
+        "opacity > 0.1 or x > 1",
+        "not x > 1",
+        "-1 < x < 1",
+        "x + y > 1",
         "__import__('os').system('true')",
-        "x[0] > 1",
-        "(lambda: x)() > 1",
-        "x if y else z > 1",
-        "x > 'a'",
-        "x > 1j",
         "size > 1",
-        "x and y > 1",
-        "not x",
-        "(x > 1) + 1 > 0",
-        "x is 1",
-        "x ** 9 > 1",
-        "x < 10 ** 400",
-        "x := 3",
-        "x > " + "1" * 500,
-        "(" * 300 + "x" + ")" * 300 + " > 1",
-        "-" * 90 + "x > 1",
-        "x > 1" + " " * 1000,
+        "x > y",
+        "x = 1",
+        "x > nan",
         "x\0 > 1",
     ],
 )
