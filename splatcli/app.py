@@ -150,6 +150,12 @@ ENTRIES = {
         _RESULT,
         panel="Files",
     ),
+    "cameras": Entry(
+        "Write cameras for other programs: those of a run, of nerfstudio or of COLMAP.",
+        "splat cameras run/ transforms.json",
+        (AS_JSON,),
+        panel="Files",
+    ),
     "doctor": Entry(
         "Check what this machine has, and what is missing.",
         "splat doctor",

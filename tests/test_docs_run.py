@@ -17,15 +17,16 @@ from tests.docs_tables import ROOT
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 # Without photographs of one's own, a browser or many minutes.
-RUN = ("status", "info", "render", "export", "convert", "edit", "verify")
+RUN = ("status", "info", "render", "export", "convert", "edit", "verify", "cameras")
 README = [words for words in splat_commands([ROOT / "README.md"]) if words[1] in RUN]
 GUIDE = (
     "splat quantise run --sog-loss-db 0.1",
     "splat prune run --rounds 0",
     "splat export run --format mesh --mesh-triangles 50000",
     "splat edit run scene/lod-meta.json",
+    "splat cameras run transforms.json",
     "splat tradeoff run",
-    "splat render --path run/2-sfm/colmap --out frames",
+    "splat render --path transforms.json --out frames",
 )
 
 

@@ -45,7 +45,7 @@ CAMERAS = FileKind(
     "cameras-unreadable",
     "cameras",
     "A whole file of cameras in one of the formats that README.md lists.",
-    "Export the cameras again; a run's own are in RUN/2-sfm/colmap.",
+    "Export the cameras again; a run's own are written by `splat cameras RUN OUT`.",
 )
 
 

@@ -118,7 +118,7 @@ def _located(path: Path) -> tuple[CameraFormat, Path]:
     for row in CAMERA_FILES:
         if located := row.locate(path):
             return row, located
-    hint = "Check the path; a run's cameras are in RUN/2-sfm/colmap."
+    hint = "Check the path; a run's cameras are written by `splat cameras RUN OUT`."
     if path.suffix.lower() == ".geojson":
         hint = "For ODM's cameras, name opensfm/reconstruction.json of its project."
     raise UsageError(

@@ -3,22 +3,28 @@
 Layout: https://docs.nerf.studio/quickstart/data_conventions.html. A frame's `transform_matrix` is
 camera to world with OpenGL's axes: x right, y up, z backward.
 
-The world is z up. Reading undoes `applied_scale` and `applied_transform`; a file without them is
+The world is z up. We write our y-down world rotated by `applied_transform` (x, z, -y), as
+nerfstudio's own import from COLMAP does. So what nerfstudio exports with that transform undone is
+in our world again. Reading undoes `applied_scale` and `applied_transform`; a file without them is
 read as it is. A frame without a size has that of its picture.
 """
 
 from __future__ import annotations
 
+import json
 import math
+import os
 from collections import ChainMap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from plyfile import PlyData, PlyElement
 
+from stages.base.atomic import replacing
 from stages.base.bad_files import CAMERAS, BadFileError, reading
 from stages.base.errors import SplatError
 from stages.cameras.camera_file import (
@@ -37,11 +43,55 @@ from stages.formats.ply_header import read_header
 from stages.scene import View
 
 OPENGL_FROM_OURS = np.diag([1.0, -1.0, -1.0])
+APPLIED_TRANSFORM = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 _PERSPECTIVE = ("PERSPECTIVE", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 _FISHEYE = "OPENCV_FISHEYE"
 MILLIMETRE = 0.001
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")  # of pictures that are named without one
 _ROLES = {"train_filenames": "train", "test_filenames": "test", "val_filenames": "val"}
+_LENS = ("w", "h", "fl_x", "fl_y", "cx", "cy")
+
+
+def write(
+    path: Path,
+    views: Sequence[View],
+    pictures: Path,
+    points: NDArray[np.float64] | None = None,
+    colours: NDArray[np.uint8] | None = None,
+) -> None:
+    """Write the views. The points go into a .ply of the same name beside the file: nerfstudio
+    initialises splats from it. Raises SplatError if a file cannot be written.
+
+    Args:
+        path: of transforms.json.
+        views: to write.
+        pictures: folder that `View.image` is relative to; the file names pictures relative to its
+            own folder.
+        points: [P, 3].
+        colours: [P, 3].
+    """
+    data: dict[str, Any] = {
+        "camera_model": "PINHOLE",
+        "applied_transform": np.hstack([APPLIED_TRANSFORM, np.zeros((3, 1))]).tolist(),
+    }
+    lenses = [_lens(view) for view in views]
+    shared = all(lens == lenses[0] for lens in lenses)
+    if shared:
+        data |= lenses[0]
+    if points is not None and colours is not None and len(points):
+        beside = path.with_suffix(".ply")
+        _write_points(beside, points @ APPLIED_TRANSFORM.T, colours)
+        data["ply_file_path"] = beside.name
+    data["frames"] = [
+        {
+            "file_path": _seen_from(path.parent, pictures / view.image),
+            **({} if shared else lens),
+            "transform_matrix": _saved_pose(view.camera.world_to_camera).tolist(),
+        }
+        for view, lens in zip(views, lenses, strict=True)
+    ]
+    with replacing(path) as partial:
+        partial.write_text(json.dumps(data, indent=1, ensure_ascii=False), encoding="utf-8")
 
 
 def read(path: Path, size: tuple[int, int] | None = None) -> CameraFile:
@@ -124,6 +174,15 @@ def _with_roles(views: tuple[View, ...], data: dict[str, Any]) -> tuple[View, ..
     return tuple(replace(view, role=roles.get(view.name, "")) for view in views)
 
 
+def _saved_pose(world_to_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[4, 4] `transform_matrix` of a camera."""
+    rotation, translation = world_to_camera[:3, :3], world_to_camera[:3, 3]
+    pose = np.eye(4)
+    pose[:3, :3] = APPLIED_TRANSFORM @ rotation.T @ OPENGL_FROM_OURS
+    pose[:3, 3] = APPLIED_TRANSFORM @ (-rotation.T @ translation)
+    return pose + 0.0  # no -0.0
+
+
 def _our_poses(data: dict[str, Any], saved: NDArray[np.float64]) -> NDArray[np.float64]:
     """[V, 3, 4] world to camera of OpenGL camera-to-world matrices [V, 3, 4]."""
     turn, shift, scale = _applied(data)
@@ -145,6 +204,12 @@ def _applied(data: dict[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.floa
     if not (math.isfinite(scale) and scale > 0):
         raise BadFileError("its applied_scale is not a positive number")
     return turn, applied[:, 3], scale
+
+
+def _lens(view: View) -> dict[str, float]:
+    camera = view.camera
+    lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+    return dict(zip(_LENS, lens, strict=True))
 
 
 def _read_numbers(
@@ -206,6 +271,24 @@ def required(values: Mapping[str, Any], key: str) -> Any:
     if key not in values:
         raise BadFileError(f"a frame has no {key}")
     return values[key]
+
+
+def _seen_from(folder: Path, picture: Path) -> str:
+    try:
+        return Path(os.path.relpath(picture, folder)).as_posix()
+    except ValueError:  # another drive
+        return picture.resolve().as_posix()
+
+
+def _write_points(path: Path, points: NDArray[np.float64], colours: NDArray[np.uint8]) -> None:
+    names = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
+    rows = np.empty(len(points), names)
+    for axis, name in enumerate("xyz"):
+        rows[name] = points[:, axis]
+    for channel, name in enumerate(("red", "green", "blue")):
+        rows[name] = colours[:, channel]
+    with replacing(path) as partial:
+        PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(partial))
 
 
 def _ply_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8] | None]:

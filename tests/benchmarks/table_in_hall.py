@@ -27,10 +27,10 @@ from PIL import Image
 from sample_captures import make, textures
 from sample_captures.make import look_at
 from sample_captures.render import Array, Lens, Shape, hit, surface
+from stages.cameras.nerfstudio import write
 from stages.scene import Camera, Reconstruction, View
 from tests.benchmarks.caster import Boxes
 from tests.benchmarks.phone_depth import true_depth
-from tests.cameras.nerfstudio_file import write
 
 WIDTH = 320
 BACKGROUND_M = 8.0  # what is deeper in a picture is background: no part of the table or its carpet

@@ -14,8 +14,8 @@ from plyfile import PlyData
 
 from stages.base.errors import SplatError
 from stages.cameras.camera_formats import read_cameras, read_points
+from stages.cameras.nerfstudio import write
 from stages.scene import Camera, View, look_at
-from tests.cameras.nerfstudio_file import write
 from tests.sfm.synthetic import random_rotation
 
 

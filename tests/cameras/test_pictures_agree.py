@@ -89,7 +89,7 @@ def test_nerfstudios_split_is_read(tmp_path: Path) -> None:
 
 
 def test_nerfstudios_points_come_back_into_the_cameras_world(tmp_path: Path) -> None:
-    from tests.cameras.nerfstudio_file import write
+    from stages.cameras.nerfstudio import write
 
     views = read_cameras(nerfstudio(tmp_path)).views
     target = tmp_path / "again.json"

@@ -21,7 +21,7 @@ from tests.cli.help_text import help_of
 ROOT = Path(__file__).parent.parent.parent
 COMMANDS = (
     *("process", *STAGE_NAMES, "status", "render", "view", "info", "convert", "verify"),
-    *("batch", "tradeoff", "compare", "edit", "doctor"),
+    *("batch", "tradeoff", "compare", "edit", "cameras", "doctor"),
 )
 HEAVY = ("torch", "numba", "cv2", "pycolmap", "numpy", "PIL", "pxr")
 

@@ -14,12 +14,12 @@ from PIL import Image
 
 from stages import formats
 from stages.base import memory
+from stages.cameras import nerfstudio
 from stages.raster.draw import render
 from stages.run import results
 from stages.scene import Camera, View, look_at
 from stages.viewer.sinks import eight_bits
 from tests import processes, scenes
-from tests.cameras import nerfstudio_file
 from tests.processes import line_of, running
 from tests.tolerances import FILM_LEVELS
 
@@ -114,7 +114,7 @@ def test_the_capture_path_passes_the_photographs(splat, scene: Path, captured) -
 
 
 def test_a_camera_file_is_drawn_camera_by_camera(splat, scene: Path, captured) -> None:
-    nerfstudio_file.write(Path("transforms.json"), captured, Path("images"))
+    nerfstudio.write(Path("transforms.json"), captured, Path("images"))
     splat("render", str(scene), "--path", "transforms.json", "--out", "f")
     pictures = sorted(Path("f").iterdir())
     for path, view in zip(pictures, captured, strict=True):
@@ -129,7 +129,7 @@ def test_a_camera_file_is_drawn_camera_by_camera(splat, scene: Path, captured) -
 
 
 def test_a_distorted_camera_file_is_drawn_with_a_note(splat, scene: Path, captured) -> None:
-    nerfstudio_file.write(Path("t.json"), captured, Path("images"))
+    nerfstudio.write(Path("t.json"), captured, Path("images"))
     data = json.loads(Path("t.json").read_text())
     Path("t.json").write_text(json.dumps(data | {"k1": 0.1}))
     result = splat("render", str(scene), "--path", "t.json", "--out", "a.mp4")

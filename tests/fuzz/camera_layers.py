@@ -26,7 +26,6 @@ from stages.cameras import (
     realityscan_xmp,
 )
 from stages.scene import Camera, View
-from tests.cameras import nerfstudio_file
 from tests.cameras.drawn_surveys import MADE, NAMES
 from tests.cameras.models import example
 from tests.fuzz.layer import Layer
@@ -42,7 +41,7 @@ def _files(kind: str) -> dict[str, bytes]:
         folder = Path(name)
         if kind == "json":
             views = [View(n, n, c) for n, c in zip(model.names, model.cameras, strict=True)]
-            nerfstudio_file.write(folder / "transforms.json", views, folder)
+            nerfstudio.write(folder / "transforms.json", views, folder)
         else:
             model.write(folder)
         if kind == "txt":
@@ -82,7 +81,7 @@ def _points(text: bool) -> bytes:
         path = Path(name) / "transforms.json"
         model = example()
         views = [View(n, n, c) for n, c in zip(model.names, model.cameras, strict=True)]
-        nerfstudio_file.write(path, views, path.parent, model.cloud.points, model.cloud.colours)
+        nerfstudio.write(path, views, path.parent, model.cloud.points, model.cloud.colours)
         data = PlyData.read(str(path.with_suffix(".ply")))
         data.text = text
         out = io.BytesIO()
