@@ -42,17 +42,17 @@ def find_run_folder(named: Path | None = None) -> Path:
     if runfolder.is_run_folder(here):
         return here
     every = sorted(path for path in here.iterdir() if _is_readable_run_folder(path))
-    found = [path for path in every if runfolder.has_finished_work(path)] or every
-    if DEFAULT in found:
+    folders = [path for path in every if runfolder.has_finished_work(path)] or every
+    if DEFAULT in folders:
         return DEFAULT
-    if len(found) == 1:
-        return found[0]
-    if found:
+    if len(folders) == 1:
+        return folders[0]
+    if folders:
         raise UsageError(
             "run-folder-unclear",
-            given=f"There are several run folders here: {', '.join(map(str, found))}.",
+            given=f"There are several run folders here: {', '.join(map(str, folders))}.",
             wanted="One of them.",
-            hint=f"Name it: splat status {found[0]}",
+            hint=f"Name it: splat status {folders[0]}",
         )
     raise RunFolderError(
         "run-folder-missing",

@@ -26,7 +26,7 @@ class OrderedCommand(HelpedCommand):
 
 def operation_parameters() -> list[Parameter]:
     """One repeatable keyword parameter for each operation."""
-    found = []
+    parameters = []
     for operation in OPERATIONS.values():
         option = typer.Option(
             f"--{operation.name}",
@@ -36,10 +36,10 @@ def operation_parameters() -> list[Parameter]:
         )
         name = operation.name.replace("-", "_")
         if operation.takes:
-            found.append(keyword(name, list[str] | None, option))
+            parameters.append(keyword(name, list[str] | None, option))
         else:
-            found.append(keyword(name, bool, option, False))
-    return found
+            parameters.append(keyword(name, bool, option, False))
+    return parameters
 
 
 def parsed_operations(ctx: typer.Context) -> list[ParsedOperation]:

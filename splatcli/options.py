@@ -31,8 +31,8 @@ def parameters(
         shown: gives the default that the help shows; by default the field's own.
         only_in_process: leave out the settings that have no panel.
     """
-    found = [s for s in settings_of(settings_type) if s.panel or not only_in_process]
-    return [_parameter(setting, (shown or shown_default)(setting)) for setting in found]
+    chosen = [s for s in settings_of(settings_type) if s.panel or not only_in_process]
+    return [_parameter(setting, (shown or shown_default)(setting)) for setting in chosen]
 
 
 def _parameter(setting: Setting, shown: str | bool) -> inspect.Parameter:

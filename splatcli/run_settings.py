@@ -28,13 +28,13 @@ _OF_ONE_CAPTURE = (
 def process_parameters() -> list[Parameter]:
     """The options of `splat process`: the settings with a panel. One that several stages have is
     listed once and given to all of them."""
-    found: dict[str, Parameter] = {}
+    parameters: dict[str, Parameter] = {}
     for name in STAGE_NAMES:
         kind = STAGE_OF[name].settings_type
         for parameter in options.parameters(kind, _shown, only_in_process=True):
-            found.setdefault(parameter.name, parameter)
+            parameters.setdefault(parameter.name, parameter)
     shown = f"{DEFAULT_PRESET}; as before where a run goes on"
-    return [_preset_parameter(shown), *found.values(), _view_parameter()]
+    return [_preset_parameter(shown), *parameters.values(), _view_parameter()]
 
 
 def batch_parameters() -> list[Parameter]:
@@ -113,15 +113,15 @@ def combined(
     chosen = dict(base)
     if preset is not None and "train" in chosen:
         chosen["train"] = PRESETS[preset]
-    found = {
+    new = {
         name: changed(settings, given if len(chosen) == 1 else options_of(name, given))
         for name, settings in chosen.items()
     }
     if "backend" in given:  # an error now, not after an hour of other work
-        with_backend = [settings for settings in found.values() if hasattr(settings, "backend")]
+        with_backend = [settings for settings in new.values() if hasattr(settings, "backend")]
         for name in {settings.backend for settings in with_backend}:
             backend_of(name).require()
-    return found
+    return new
 
 
 def of_new_run(given: Mapping[str, Any]) -> dict[str, Any]:

@@ -53,7 +53,7 @@ def convert(
             console.step(f"comparing {target}", done=2, total=_STEPS)
             cameras = cameras_for(splats, views)
             prover = Prover.of(splats, cameras, source_format=rows[0].ending)
-            found, losses = require_proven(written, prover, "convert-verify-failed")
+            figures, losses = require_proven(written, prover, "convert-verify-failed")
     size = rows[1].size_bytes(target)
     facts: dict[str, Any] = {
         "source": str(source),
@@ -63,7 +63,7 @@ def convert(
         "size_bytes": size,
         "bytes_per_splat": round(size / max(1, len(splats)), 2),
         "seconds": round(time.monotonic() - begun, 2),
-        **found,
+        **figures,
         "warnings": [*losses.values()],
     }
     if console.mode.as_json:
@@ -73,7 +73,7 @@ def convert(
         console.warn(f"Warning: {dropped} splats that no viewer can draw were left out.")
     for warning in losses.values():
         console.warn(f"Warning: {warning}")
-    _show(facts, found)
+    _show(facts, figures)
 
 
 def _refuse_nothing(source: Path, target: Path, splats: Splats, dropped: int) -> None:
@@ -90,13 +90,15 @@ def _refuse_nothing(source: Path, target: Path, splats: Splats, dropped: int) ->
         )
 
 
-def _show(facts: dict[str, Any], found: dict[str, Any]) -> None:
+def _show(facts: dict[str, Any], figures: dict[str, Any]) -> None:
     size = f"{facts['splats']:,} splats, {console.size(facts['size_bytes'])}"
-    quality = console.fidelity(found["verify_db"])
-    alike = not facts["warnings"] and console.EXACT_DB > found["verify_db"] >= _UNSEEN_DB
+    quality = console.fidelity(figures["verify_db"])
+    alike = not facts["warnings"] and console.EXACT_DB > figures["verify_db"] >= _UNSEEN_DB
     seen = ", no difference is seen" if alike else ""
     each = f"{facts['bytes_per_splat']:.1f} bytes each"
     console.note(f"{facts['target']}: {size}, {each}, {quality}{seen}")
-    worst = {name: found[name] for name in found if name.startswith("max_") and found[name] > 0}
+    worst = {
+        name: figures[name] for name in figures if name.startswith("max_") and figures[name] > 0
+    }
     if worst and not console.mode.quiet:
         console.note(f"Largest differences: {console.figures(worst)}", "dim")

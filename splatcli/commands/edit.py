@@ -113,12 +113,12 @@ def _load_scene(source: Path, antialias: bool) -> tuple[EditedScene, int]:
         raise nothing_drawable(source, dropped)
     if pipeline is None or pipeline.manifest("sfm") is None:
         return EditedScene(splats, units_of(source)), dropped
-    found = pipeline.load("sfm")
-    training, held = split_held_out(found.views)
-    photographs = load_evaluation_views(found.folder, training, splats.draw_settings)
-    evaluation = load_evaluation_views(found.folder, held, splats.draw_settings) or photographs
+    sfm = pipeline.load("sfm")
+    training, held = split_held_out(sfm.views)
+    photographs = load_evaluation_views(sfm.folder, training, splats.draw_settings)
+    evaluation = load_evaluation_views(sfm.folder, held, splats.draw_settings) or photographs
     scene = EditedScene(
-        *(splats, found.units, photographs, evaluation, found.views),
+        *(splats, sfm.units, photographs, evaluation, sfm.views),
         backend=results.backend_of_run(pipeline),
     )
     return scene, dropped
@@ -142,22 +142,22 @@ def _written(
 def _quality(scene: EditedScene) -> dict[str, float]:
     """The share of the held-out pictures that is kept, where it is not all, and their PSNR, where
     it can be compared."""
-    found: dict[str, float] = {}
+    quality: dict[str, float] = {}
     if scene.kept_share < 1:
-        found["pictures_kept"] = round(scene.kept_share, 4)
+        quality["pictures_kept"] = round(scene.kept_share, 4)
     if (psnr_db := scene.psnr_db()) is not None:
-        found["psnr_db"] = round(psnr_db, 3)
-    return found
+        quality["psnr_db"] = round(psnr_db, 3)
+    return quality
 
 
 def _quality_text(facts: dict[str, Any]) -> str:
     """`_quality` for the end of a line."""
-    found = ""
+    text = ""
     if "pictures_kept" in facts:
-        found += f", {facts['pictures_kept']:.1%} of the photographs' pictures kept"
+        text += f", {facts['pictures_kept']:.1%} of the photographs' pictures kept"
     if "psnr_db" in facts:
-        found += f", {facts['psnr_db']:.2f} dB on photographs"
-    return found
+        text += f", {facts['psnr_db']:.2f} dB on photographs"
+    return text
 
 
 def _report(parsed: ParsedOperation, before: int, scene: EditedScene) -> dict[str, Any]:

@@ -81,10 +81,10 @@ def describe(splats: Splats, statistics: Statistics) -> dict[str, Any]:
 
 def warnings_of(statistics: Statistics) -> list[tuple[str, str]]:
     """(code, sentence) for each kind of defect that is there."""
-    found = []
+    warnings = []
     for name, count in statistics.not_finite.items():
         what = f"{_share(count, statistics)} not finite in their {_ATTRIBUTES[name]}"
-        found.append((f"not-finite-{_ATTRIBUTES[name]}", f"{what}: no viewer can draw them."))
+        warnings.append((f"not-finite-{_ATTRIBUTES[name]}", f"{what}: no viewer can draw them."))
     kinds = {
         "no-rotation": "without a rotation: no viewer can draw them.",
         "too-large": "larger than numbers go: no viewer can draw them.",
@@ -94,8 +94,8 @@ def warnings_of(statistics: Statistics) -> list[tuple[str, str]]:
     }
     for code, what in kinds.items():
         if count := statistics.troubles.get(code, 0):
-            found.append((code, f"{_share(count, statistics)} {what}"))
-    return found
+            warnings.append((code, f"{_share(count, statistics)} {what}"))
+    return warnings
 
 
 def _share(count: int, statistics: Statistics) -> str:

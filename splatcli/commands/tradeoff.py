@@ -47,15 +47,15 @@ def tradeoff(
     folder = out or pipeline.run_folder / "tradeoff"
     make_folder(folder)
     console.note_compiling()
-    found = measure_tradeoff(inputs, console.step)
-    files = write_report(folder, pipeline.run_folder.absolute().name, found, inputs)
+    result = measure_tradeoff(inputs, console.step)
+    files = write_report(folder, pipeline.run_folder.absolute().name, result, inputs)
     if console.mode.as_json:
         console.emit(
-            "tradeoff", folder=str(folder), files=[str(f) for f in files], summary=summarise(found)
+            "tradeoff", folder=str(folder), files=[str(f) for f in files], summary=summarise(result)
         )
         return
     if not console.mode.quiet:
-        for title, lines in summarise(found).items():
+        for title, lines in summarise(result).items():
             for number, line in enumerate(lines):
                 console.out.print(f"{title if not number else '':<12} {line}", markup=False)
     console.out.print(str(files[0]), markup=False)

@@ -63,7 +63,7 @@ def verify(
     for file in files:
         formats.format_of(file)  # raises before any work is done
     console.note_compiling()
-    original, found = None, []
+    original, proofs = None, []
     losses: list[str] = []
     for number, file in enumerate(files):
         console.step(f"verifying {file}", done=number, total=len(files))
@@ -74,7 +74,7 @@ def verify(
             proof = prover.prove(file)
             if not proof.fault:
                 break
-        found.append((file, proof))
+        proofs.append((file, proof))
         shown = [] if proof.fault else [*changes_shown(file, prover.splats, proof).values()]
         if (apart := float(np.linalg.norm(origin - prover.splats.origin))) > _ELSEWHERE:
             shown.append(
@@ -86,8 +86,8 @@ def verify(
             console.emit("verified", **_facts(file, proof, original), warnings=shown)
     assert original is not None
     if not console.mode.as_json:
-        _print(found, original, losses)
-    _raise_if_wrong(found, original)
+        _print(proofs, original, losses)
+    _raise_if_wrong(proofs, original)
 
 
 def _files(target: Path | None) -> list[Path]:
@@ -166,8 +166,8 @@ def _facts(file: Path, proof: Proof, original: _Original) -> dict[str, Any]:
     }
 
 
-def _print(found: list[tuple[Path, Proof]], original: _Original, losses: list[str]) -> None:
-    facts = [_facts(file, proof, original) for file, proof in found]
+def _print(proofs: list[tuple[Path, Proof]], original: _Original, losses: list[str]) -> None:
+    facts = [_facts(file, proof, original) for file, proof in proofs]
     if console.mode.quiet:
         for each in facts:
             what = each["fault"] or console.fidelity(each["verify_db"])
@@ -182,7 +182,7 @@ def _print(found: list[tuple[Path, Proof]], original: _Original, losses: list[st
     rows.append(("worst", *map(_worst, facts)))
     rows.append(("verdict", *("wrong" if each["fault"] else "right" for each in facts)))
     console.table(
-        ("", *(file.name for file, _ in found)), rows, title=f"Compared with {original.name}"
+        ("", *(file.name for file, _ in proofs)), rows, title=f"Compared with {original.name}"
     )
     for loss in losses:
         console.warn(f"Warning: {loss}")
@@ -206,8 +206,8 @@ def _label(name: str) -> str:
     return labels.get(name, console.label(name))
 
 
-def _raise_if_wrong(found: list[tuple[Path, Proof]], original: _Original) -> None:
-    wrong = [(file, proof.fault) for file, proof in found if proof.fault]
+def _raise_if_wrong(proofs: list[tuple[Path, Proof]], original: _Original) -> None:
+    wrong = [(file, proof.fault) for file, proof in proofs if proof.fault]
     if not wrong:
         return
     raise QualityError(

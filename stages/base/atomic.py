@@ -42,8 +42,8 @@ def remove_abandoned_files(folder: Path) -> None:
     partial = re.compile(re.escape(f"{_PARTIAL}{_machine()}-") + r"(\d+)-")
     with suppress(OSError, OverflowError):  # tidying up must not stop the work
         for path in list(folder.iterdir()):
-            found = partial.match(path.name)
-            if found and not psutil.pid_exists(int(found[1])):
+            process = partial.match(path.name)
+            if process and not psutil.pid_exists(int(process[1])):
                 path.unlink() if not path.is_dir() else shutil.rmtree(path, ignore_errors=True)
 
 

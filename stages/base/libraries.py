@@ -51,10 +51,10 @@ def modules_of(name: str) -> tuple[str, ...]:
 def versions() -> dict[str, str]:
     """Versions by distribution name, with Python's and the project's own; missing ones are left
     out. No library is imported."""
-    found = {"python": platform.python_version(), NAME: VERSION}
+    version_of = {"python": platform.python_version(), NAME: VERSION}
     for name in needed():
         try:
-            found[name] = version(name)
+            version_of[name] = version(name)
         except PackageNotFoundError:
             continue
-    return found
+    return version_of

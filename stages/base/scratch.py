@@ -55,7 +55,7 @@ def empty(shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
                 os.posix_fallocate(file.fileno(), 0, size)
             else:
                 file.truncate(size)
-            found = np.memmap(file, dtype, "r+", shape=shape)
+            array = np.memmap(file, dtype, "r+", shape=shape)
     except OSError as error:
         if spare:
             return np.empty(shape, dtype)
@@ -65,8 +65,8 @@ def empty(shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
             wanted="The disk must have room for temporary data and for the output.",
             hint="Free some space, or write to a folder on another disk.",
         ) from error
-    _maps.add(found._mmap)  # type: ignore[attr-defined]
-    return found
+    _maps.add(array._mmap)  # type: ignore[attr-defined]
+    return array
 
 
 def release_scratch_pages() -> None:

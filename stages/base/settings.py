@@ -137,7 +137,7 @@ _type_hints = cache(get_type_hints)  # evaluating them again for every use slows
 def settings_of(settings_type: type) -> list[Setting]:
     """Every field of a settings dataclass, in order."""
     hints = _type_hints(settings_type)
-    found = []
+    settings = []
     for field in fields(settings_type):
         hint, optional = hints[field.name], False
         if get_origin(hint) in (Union, types.UnionType):
@@ -146,7 +146,7 @@ def settings_of(settings_type: type) -> list[Setting]:
         many = get_origin(hint) in (tuple, list)
         more = dict(field.metadata)
         option = more.pop("option", field.name.removesuffix("s") if many else field.name)
-        found.append(
+        settings.append(
             Setting(
                 name=field.name,
                 flag="--" + option.replace("_", "-"),
@@ -157,7 +157,7 @@ def settings_of(settings_type: type) -> list[Setting]:
                 **more,
             )
         )
-    return found
+    return settings
 
 
 def check_settings(settings: Any) -> None:

@@ -57,8 +57,8 @@ def read(path: Path) -> CameraFile:
     images = dict(_POLYCAM).get(path.name)
     files = sorted(path.glob("*.json" if images else _FRAMES))
     pictures = path.parent / images if images else path
-    found = {file: picture_beside(pictures / file.name) for file in files}
-    with_picture = [file for file in files if found[file] is not None] or files
+    picture_of = {file: picture_beside(pictures / file.name) for file in files}
+    with_picture = [file for file in files if picture_of[file] is not None] or files
     posed = []
     for file in with_picture:
         with reading(file, CAMERAS):
@@ -66,9 +66,9 @@ def read(path: Path) -> CameraFile:
             if not isinstance(frame, dict):
                 raise BadFileError("it is not an object")
             parse: Callable[..., Posed] = _polycam if images else _scanner_app
-            posed.append(parse(frame, found[file]))
+            posed.append(parse(frame, picture_of[file]))
     with reading(with_picture[0], CAMERAS):
-        names = [getattr(found[file], "name", file.stem) for file in with_picture]
+        names = [getattr(picture_of[file], "name", file.stem) for file in with_picture]
         to_world = np.array([pose for _, pose in posed])
         with np.errstate(all="ignore"):  # `camera_file` checks the result
             rotations = OPENGL_FROM_OURS @ to_world[:, :, :3].transpose(0, 2, 1)

@@ -27,13 +27,13 @@ def read(folder: Path) -> CameraFile:
     first = nerfstudio.read(_part(folder, "train"))
     size = first.views[0].camera.width, first.views[0].camera.height
     others = [name for name in _SPLITS[1:] if _part(folder, name).is_file()]
-    found = [("train", first)] + [
+    parts = [("train", first)] + [
         (name, nerfstudio.read(_part(folder, name), size)) for name in others
     ]
     return CameraFile(
-        tuple(replace(view, role=name) for name, part in found for view in part.views),
+        tuple(replace(view, role=name) for name, part in parts for view in part.views),
         folder,
-        tuple(lens for _, part in found for lens in part.lenses),
+        tuple(lens for _, part in parts for lens in part.lenses),
     )
 
 

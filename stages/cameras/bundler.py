@@ -79,12 +79,12 @@ def _names(path: Path) -> list[str]:
     """The first word of each line of the list of pictures."""
     near = (path.with_suffix(".txt"), path.parent / "list.txt", path.parent.parent / "list.txt",
             path.with_name(f"{path.name}.list.txt"))  # fmt: skip
-    found = next((file for file in near if file.is_file()), None)
-    if found is None:
+    file_of_names = next((file for file in near if file.is_file()), None)
+    if file_of_names is None:
         raise BadFileError(
             f"there is no list of pictures (list.txt) beside {path.name}",
             hint=f"Write {path.with_name('list.txt')}: the name of one picture a line, in the "
             "order of the cameras.",
         )
-    lines = found.read_text(encoding="utf-8").splitlines()
+    lines = file_of_names.read_text(encoding="utf-8").splitlines()
     return [line.split()[0] for line in lines if line.strip()]

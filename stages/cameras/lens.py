@@ -76,13 +76,13 @@ class Lens:
     def undistort(self, seen: NDArray[np.float64]) -> NDArray[np.float64]:
         """[N, 2] the inverse of `distort` by Newton's method, in the region around the axis where
         `distort` is injective; NaN outside it, and beyond `MAX_ANGLE`."""
-        at, found = self._solved(seen)
+        at, converged = self._solved(seen)
         if self.by_angle:
             with np.errstate(all="ignore"):
                 angle = np.linalg.norm(at, axis=1, keepdims=True)
-                found &= angle[:, 0] < MAX_ANGLE
+                converged &= angle[:, 0] < MAX_ANGLE
                 at = at * _ratio(np.tan(angle), angle)
-        return np.where(found[:, None], at, np.nan)
+        return np.where(converged[:, None], at, np.nan)
 
     def project(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
         """[..., 2] distorted coordinates of directions [..., 3] of any length, of a fisheye. They
@@ -94,12 +94,12 @@ class Lens:
     def directions(self, seen: NDArray[np.float64]) -> NDArray[np.float64]:
         """[N, 3] unit directions that a fisheye shows at `seen` [N, 2]: the inverse of `project`.
         NaN as of `undistort`, but up to all around."""
-        at, found = self._solved(seen)
+        at, converged = self._solved(seen)
         with np.errstate(all="ignore"):
             angle = np.linalg.norm(at, axis=1, keepdims=True)
-            found &= angle[:, 0] < _BEHIND
+            converged &= angle[:, 0] < _BEHIND
             shown = np.hstack([at * _ratio(np.sin(angle), angle), np.cos(angle)])
-        return np.where(found[:, None], shown, np.nan)
+        return np.where(converged[:, None], shown, np.nan)
 
     def widest_angle(self) -> float:
         """The angle from the axis, radians, up to which a fisheye is injective: beyond, its radius
@@ -108,8 +108,8 @@ class Lens:
         around = np.stack([np.cos(turns), np.sin(turns)], axis=-1)
         at = angles[:, None, None] * around
         with np.errstate(all="ignore"):
-            found = np.linalg.det(self._jacobian(at.reshape(-1, 2))).reshape(at.shape[:2])
-        good = np.logical_and.accumulate((found > 0).all(axis=1))
+            determinants = np.linalg.det(self._jacobian(at.reshape(-1, 2))).reshape(at.shape[:2])
+        good = np.logical_and.accumulate((determinants > 0).all(axis=1))
         return float(angles[max(int(good.sum()) - 1, 0)])
 
     def _solved(self, seen: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
@@ -121,11 +121,11 @@ class Lens:
                 step = np.einsum("nij,nj->ni", _inverse(self._jacobian(at)), off)
                 length = np.linalg.norm(step, axis=1, keepdims=True)
                 at = at - step * np.minimum(1.0, 0.3 / np.maximum(length, 1e-12))
-            found = np.abs(self._distorted(at) - seen).max(axis=1) < _TOLERANCE
+            converged = np.abs(self._distorted(at) - seen).max(axis=1) < _TOLERANCE
             # A step may jump over a fold: from the axis on, the determinant must stay positive.
             for share in np.linspace(0.0, 1.0, 17):
-                found &= np.linalg.det(self._jacobian(share * at)) > 0
-        return at, found
+                converged &= np.linalg.det(self._jacobian(share * at)) > 0
+        return at, converged
 
     def _jacobian(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
         """[N, 2, 2] derivatives of `_distorted`."""

@@ -110,8 +110,8 @@ def read(path: Path, size: tuple[int, int] | None = None) -> CameraFile:
         for row, frame in zip(saved, frames, strict=True):
             row[:] = np.array(required(frame, "transform_matrix"), np.float64)[:3]
         names = [str(required(frame, "file_path")) for frame in frames]
-        found = camera_file(path.parent, names, optics, _our_poses(data, saved))
-        return replace(found, views=_with_roles(found.views, data))
+        cameras = camera_file(path.parent, names, optics, _our_poses(data, saved))
+        return replace(cameras, views=_with_roles(cameras.views, data))
 
 
 def read_points(path: Path) -> FilePoints | None:
@@ -154,12 +154,12 @@ def depth_maps(path: Path) -> tuple[dict[str, Path], float]:
         unit = float(data.get("depth_unit_scale_factor", MILLIMETRE))
         if not (math.isfinite(unit) and unit > 0):
             raise BadFileError("its depth_unit_scale_factor is not a positive number")
-        found = {}
+        maps = {}
         for frame in data["frames"]:
             if named := str(frame.get("depth_file_path") or ""):
                 check_inside(path.parent, named, path.parent)
-                found[str(required(frame, "file_path"))] = path.parent / named
-        return found, unit
+                maps[str(required(frame, "file_path"))] = path.parent / named
+        return maps, unit
 
 
 def _document(path: Path) -> dict[str, Any]:

@@ -65,8 +65,8 @@ def read(path: Path) -> CameraFile:
             rotations = Rotation.from_rotvec(turns).as_matrix()
         poses = np.concatenate([rotations, shifts.reshape(-1, 3, 1)], axis=2)
         own = [optics[shot["camera"]] for shot in shots.values()]
-        found = camera_file(path.parent / "images", list(shots), own, poses)
-        return replace(found, georeference=_georeference(data, found.views))
+        cameras = camera_file(path.parent / "images", list(shots), own, poses)
+        return replace(cameras, georeference=_georeference(data, cameras.views))
 
 
 def _georeference(data: Mapping[str, Any], views: tuple[View, ...]) -> Georeference:

@@ -76,9 +76,9 @@ def undistorted_px(
     xy: NDArray[np.float64], camera: Camera, lens: Lens, pinhole: Camera
 ) -> NDArray[np.float64]:
     """[N, 2] where photograph pixels `xy` lie in the pinhole picture (NaN if nowhere)."""
-    found = _from_principal_point(xy, camera, lens)
-    found += (pinhole.cx, pinhole.cy)
-    return found
+    px = _from_principal_point(xy, camera, lens)
+    px += (pinhole.cx, pinhole.cy)
+    return px
 
 
 def _from_principal_point(

@@ -41,7 +41,7 @@ class Row:
 def run_names(captures: Sequence[Location]) -> dict[str, Location]:
     """Captures by the name of their run folder: the name of the folder or of the video. Raises
     SplatError "batch-same-name"."""
-    found: dict[str, Location] = {}
+    runs: dict[str, Location] = {}
     taken: dict[str, Location] = {}
     for location in captures:
         name = remote.capture_name(location)
@@ -53,8 +53,8 @@ def run_names(captures: Sequence[Location]) -> dict[str, Location]:
                 wanted="Captures of different names: each gives its run folder its own.",
                 hint="Name the folders above them (captures/*), or rename one.",
             )
-        found[name] = taken[name.casefold()] = location
-    return found
+        runs[name] = taken[name.casefold()] = location
+    return runs
 
 
 def check_output(runs: Location, captures: Sequence[Location]) -> None:
@@ -105,18 +105,18 @@ class BatchTable:
 
 def row_of(run_folder: Path) -> Row:
     """The figures in the manifests of a run folder; blank where one is missing or unreadable."""
-    found: dict[str, Manifest] = {}
+    manifests: dict[str, Manifest] = {}
     for number, name in enumerate(STAGE_NAMES, start=1):
         with suppress(SplatError):
             manifest = Manifest.read(run_folder / f"{number}-{name}")
             if manifest is not None:
-                found[name] = manifest
+                manifests[name] = manifest
     row = Row(run_folder.name)
-    if found:
-        codes = (code for manifest in found.values() for code, _ in manifest.warnings)
-        seconds = round(sum(manifest.seconds for manifest in found.values()), 1)
+    if manifests:
+        codes = (code for manifest in manifests.values() for code, _ in manifest.warnings)
+        seconds = round(sum(manifest.seconds for manifest in manifests.values()), 1)
         row = replace(row, seconds=seconds, warnings=" ".join(dict.fromkeys(codes)))
-    quantise, export = found.get("quantise"), found.get("export")
+    quantise, export = manifests.get("quantise"), manifests.get("export")
     if quantise is not None and quantise.metrics.get("measured_on") == "held out":
         row = replace(row, psnr_db=round(quantise.metrics["psnr_kept_db"], 3))
     if export is not None:

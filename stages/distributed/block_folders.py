@@ -56,9 +56,9 @@ def begin(
 
 
 def _of(whole: Pipeline, name: str) -> Manifest:
-    found = whole.manifest(name)
-    assert found is not None, f"{name} runs before training"
-    return found
+    manifest = whole.manifest(name)
+    assert manifest is not None, f"{name} runs before training"
+    return manifest
 
 
 def _finish(folder: Path, like: Manifest) -> Manifest:

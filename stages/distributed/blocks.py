@@ -122,8 +122,8 @@ class _BlockTraining:
         crossing = [v for v, across in zip(self.whole.views, crosses, strict=True) if across]
         seam_views = [view for view in crossing if view in training]
         trained = self._merge(parts, cells, seam_views, draw_settings, len(training))
-        found = self._evaluate(trained.splats, held, folder)
-        wrong = found.grade == WRONG and self.whole.contradicted
+        verdict = self._evaluate(trained.splats, held, folder)
+        wrong = verdict.grade == WRONG and self.whole.contradicted
         trained = replace(trained, contradicted=wrong)
         save(folder, trained)
         self.report.metric("training_views", len(training))
@@ -238,8 +238,8 @@ class _BlockTraining:
         return cap
 
     def _trained(self, name: str) -> TrainedSplats:
-        found: TrainedSplats = Pipeline(self.root / name).load("train")
-        return found
+        trained: TrainedSplats = Pipeline(self.root / name).load("train")
+        return trained
 
     def _run(self, names: Sequence[str], most_splats: int) -> None:
         """Train in the run folders of these names. Raises SplatError for the first that failed,

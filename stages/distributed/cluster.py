@@ -108,8 +108,8 @@ class RayExecutor:
 
     def _result(self, reference: Any) -> TaskResult:
         try:
-            found: TaskResult = self.ray.get(reference)
-            return found
+            result: TaskResult = self.ray.get(reference)
+            return result
         except self.ray.exceptions.RayError as error:
             why = str(error).strip().splitlines()[0]
             return TaskResult(int(Family.RESOURCES), "worker-lost", f"Its worker was lost: {why}")
@@ -134,8 +134,8 @@ def open_executor(
     if address is None:
         yield SerialExecutor(listener)
         return
-    with connect(address, folder, paths) as found:
-        yield found
+    with connect(address, folder, paths) as executor:
+        yield executor
 
 
 @contextmanager
@@ -218,12 +218,12 @@ def _start(ray: Any, address: str) -> None:
         store = {"object_store_memory": 100 * _MIB}  # enough for paths and figures
         ray.init(address="local", num_cpus=int(local[1]), **store, **quiet)
         return
-    found = _ADDRESS.fullmatch(address)
-    if found is None and address != "auto":
+    host = _ADDRESS.fullmatch(address)
+    if host is None and address != "auto":
         raise _not_found(address, "it is no address")
     try:
-        if found is not None:
-            socket.create_connection((found[1], int(found[2])), _CONNECT_TIMEOUT_S).close()
+        if host is not None:
+            socket.create_connection((host[1], int(host[2])), _CONNECT_TIMEOUT_S).close()
         ray.init(address=address, log_to_driver=False, logging_level="ERROR")
     except (OSError, OverflowError, RuntimeError, ValueError) as error:
         raise _not_found(address, str(error).strip().splitlines()[0]) from error

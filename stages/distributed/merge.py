@@ -65,11 +65,11 @@ def at_seams(splats: Splats, counts: Sequence[int], cells: Sequence[Cell]) -> ND
     """[N] which splats of `merge_blocks` extend over the border of their cell."""
     reach = REACH * np.exp(splats.log_scales.max(axis=1).astype(np.float64))
     ends = np.cumsum([0, *counts])
-    found = np.zeros(len(splats), bool)
+    crossing = np.zeros(len(splats), bool)
     for cell, start, end in zip(cells, ends[:-1], ends[1:], strict=True):
         rows = slice(start, end)
-        found[rows] = cell.border_distance(splats.means[rows]) < reach[rows]
-    return found
+        crossing[rows] = cell.border_distance(splats.means[rows]) < reach[rows]
+    return crossing
 
 
 def finetune_seams(
@@ -88,13 +88,13 @@ def finetune_seams(
 
     Returns: (the splats, [N] which were removed).
     """
-    found = measure_contributions(splats, views, backend)
-    candidates = np.flatnonzero(seam & (found.sse_change < 0))
-    candidates = candidates[np.argsort(found.sse_change[candidates], kind="stable")]
+    measured = measure_contributions(splats, views, backend)
+    candidates = np.flatnonzero(seam & (measured.sse_change < 0))
+    candidates = candidates[np.argsort(measured.sse_change[candidates], kind="stable")]
     for fraction in REMOVED_FRACTIONS:
         removed = np.zeros(len(splats), bool)
         removed[candidates[: int(fraction * len(candidates))]] = True
-        if squared_error(splats.take(~removed), views, backend) <= found.sse:
+        if squared_error(splats.take(~removed), views, backend) <= measured.sse:
             break
     steps = min(MAX_STEPS, STEPS_PER_VIEW * len(views))
-    return finetuner.finetune(splats.take(~removed), steps, found.view_counts[~removed]), removed
+    return finetuner.finetune(splats.take(~removed), steps, measured.view_counts[~removed]), removed

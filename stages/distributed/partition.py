@@ -49,8 +49,7 @@ class Cell:
         that line's axis; world units."""
         ground = points[:, _GROUND].astype(np.float64)
         sides = np.concatenate([np.abs(ground - self.low), np.abs(ground - self.high)], axis=1)
-        found: NDArray[np.float64] = sides.min(axis=1)
-        return found
+        return np.asarray(sides.min(axis=1))
 
 
 EVERYWHERE = Cell((-UNBOUNDED, -UNBOUNDED), (UNBOUNDED, UNBOUNDED))
@@ -113,8 +112,7 @@ def partition(
 def _extent(places: NDArray[np.float64]) -> NDArray[np.float64]:
     """[2] the distance between two percentiles along each axis."""
     low, high = np.percentile(places, _EXTENT_PERCENTILES, axis=0)
-    found: NDArray[np.float64] = high - low
-    return found
+    return np.asarray(high - low)
 
 
 def margin(places: NDArray[np.float64]) -> float:
@@ -128,12 +126,12 @@ def block_fractions(
     """[blocks, cameras] the fraction of each picture that comes from splats in each cell, 0 to 1;
     occluded splats do not count. All 0 for a camera that sees nothing."""
     inside = [cell.holds(splats.means) for cell in cells]
-    found = []
+    shares = []
     small = (camera.fitted(SIDE) for camera in cameras)
     for rows, weight in blend_weights(splats, small, backend):
         total = float(weight.sum())
-        found.append([float(weight[own[rows]].sum()) / total if total else 0.0 for own in inside])
-    return np.array(found).T.reshape(len(cells), -1)
+        shares.append([float(weight[own[rows]].sum()) / total if total else 0.0 for own in inside])
+    return np.array(shares).T.reshape(len(cells), -1)
 
 
 def assign_views(fractions: NDArray[np.float64]) -> NDArray[np.bool_]:

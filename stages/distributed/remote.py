@@ -46,10 +46,10 @@ def parse_location(text: str) -> Location:
 
 def expand_locations(texts: Iterable[str]) -> list[Location]:
     """The locations; a URL with * in it is replaced by all that match it. Raises SplatError."""
-    found: list[Location] = []
+    every: list[Location] = []
     for location in map(parse_location, texts):
-        found += RemoteFolder.at(location).matches() if isinstance(location, str) else [location]
-    return found
+        every += RemoteFolder.at(location).matches() if isinstance(location, str) else [location]
+    return every
 
 
 def capture_name(location: Location) -> str:
@@ -134,10 +134,10 @@ class RemoteFolder:
         if "*" not in self.root:
             return [self.url]
         with self._as_splat_errors():
-            found = sorted(self.system.glob(self.root))
-        if not found:
+            paths = sorted(self.system.glob(self.root))
+        if not paths:
             raise _missing(self.url)
-        return [self.system.unstrip_protocol(path) for path in found]
+        return [self.system.unstrip_protocol(path) for path in paths]
 
     def names(self) -> list[str]:
         """The relative posix paths of all files in it; [""] for a file, [] if it does not exist.
@@ -146,8 +146,8 @@ class RemoteFolder:
             self.system.invalidate_cache()
             if not self.system.exists(self.root):
                 return []
-            found = [str(path) for path in self.system.find(self.root)]
-        names = sorted(path[len(self.root) :].lstrip("/") for path in found)
+            paths = [str(path) for path in self.system.find(self.root)]
+        names = sorted(path[len(self.root) :].lstrip("/") for path in paths)
         return [name for name in names if ".." not in PurePosixPath(name).parts]
 
     def fetch(self, names: Iterable[str], target: Path) -> None:

@@ -117,10 +117,10 @@ def _merge_pairs(
     part: Splats, pairs: NDArray[np.intp], splats: Splats, rows: NDArray[np.intp]
 ) -> None:
     """Merge the splats `rows` of `splats` into the splats `pairs` of `part`, in place."""
-    found, share = merge(Moments.of(part, pairs), Moments.of(splats, rows))
-    part.means[pairs] = found.means
-    part.quaternions[pairs], part.log_scales[pairs] = found.shapes()
-    part.opacity_logits[pairs] = logit(found.opacities)
+    merged, share = merge(Moments.of(part, pairs), Moments.of(splats, rows))
+    part.means[pairs] = merged.means
+    part.quaternions[pairs], part.log_scales[pairs] = merged.shapes()
+    part.opacity_logits[pairs] = logit(merged.opacities)
     mine = share.astype(part.sh.dtype)[:, None, None]
     part.sh[pairs] = mine * part.sh[pairs] + (1 - mine) * splats.sh[rows]
     part.sh_degrees[pairs] = np.maximum(part.sh_degrees[pairs], splats.sh_degrees[rows])

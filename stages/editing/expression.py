@@ -42,11 +42,11 @@ def parse_expression(text: str) -> Callable[[Splats], NDArray[np.bool_]]:
     but for "!=". Raises SplatError "edit-keep" for what is no condition."""
     comparisons = []
     for part in re.split(r"\sand\s", text):
-        found = _COMPARISON.fullmatch(part)
-        if found is None or found[1] not in VARIABLES:
-            why = "is not understood" if found is None else f"names {found[1]}, which splats lack"
+        match = _COMPARISON.fullmatch(part)
+        if match is None or match[1] not in VARIABLES:
+            why = "is not understood" if match is None else f"names {match[1]}, which splats lack"
             raise _wrong(text, f"{part.strip()[:60]!r} {why}")
-        comparisons.append((VARIABLES[found[1]], _COMPARISONS[found[2]], float(found[3])))
+        comparisons.append((VARIABLES[match[1]], _COMPARISONS[match[2]], float(match[3])))
 
     def condition(splats: Splats) -> NDArray[np.bool_]:
         kept = np.ones(len(splats), bool)

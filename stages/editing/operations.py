@@ -98,10 +98,10 @@ def _keeping(condition: Callable[[Splats], NDArray[np.bool_]]) -> Operation:
     """Keep the splats for which a condition is true; it is computed for a block at a time."""
 
     def kept(scene: EditedScene) -> EditedScene:
-        found = np.empty(len(scene.splats), bool)
-        for rows in row_slices(len(found)):
-            found[rows] = condition(scene.splats.take(rows))
-        return scene.reduced_to(found)
+        kept_rows = np.empty(len(scene.splats), bool)
+        for rows in row_slices(len(kept_rows)):
+            kept_rows[rows] = condition(scene.splats.take(rows))
+        return scene.reduced_to(kept_rows)
 
     return kept
 
@@ -113,10 +113,12 @@ def _transforming(similarity: Similarity) -> Operation:
 def _without_floaters(scene: EditedScene) -> EditedScene:
     """Floaters by their contributions where training views are known, else isolated splats."""
     if len(scene.training_views):
-        found = near_camera_floaters(scene.splats, scene.contributions(), scene.training_cameras())
+        floaters = near_camera_floaters(
+            scene.splats, scene.contributions(), scene.training_cameras()
+        )
     else:
-        found = isolated_splats(scene.splats)
-    return scene.with_splats(select_rows(scene.splats, ~found))
+        floaters = isolated_splats(scene.splats)
+    return scene.with_splats(select_rows(scene.splats, ~floaters))
 
 
 def _merging(path: Path) -> Operation:
@@ -235,25 +237,25 @@ def _direction(parsed: ParsedOperation, text: str) -> NDArray[np.float64]:
     """[3] a unit vector from +x, -y, z, or three numbers."""
     if text[-1:] in _AXES and text[:-1] in ("", "+", "-"):
         return np.array(_AXES[text[-1]]) * (-1.0 if text[0] == "-" else 1.0)
-    found = _vector(parsed, text)
-    length = np.linalg.norm(found)
+    vector = _vector(parsed, text)
+    length = np.linalg.norm(vector)
     if not 0 < length < np.inf:
         raise _wrong(parsed)
-    return np.asarray(found / length)
+    return np.asarray(vector / length)
 
 
 def _vector(parsed: ParsedOperation, text: str) -> NDArray[np.float64]:
-    found = regions.parse_numbers(text, 3)
-    if found is None:
+    vector = regions.parse_numbers(text, 3)
+    if vector is None:
         raise _wrong(parsed)
-    return found
+    return vector
 
 
 def _number(parsed: ParsedOperation, low: float, high: float, whole: bool = False) -> float:
-    found = regions.parse_numbers(parsed.value, 1)
-    if found is None or not low <= found[0] <= high or (whole and found[0] != int(found[0])):
+    one = regions.parse_numbers(parsed.value, 1)
+    if one is None or not low <= one[0] <= high or (whole and one[0] != int(one[0])):
         raise _wrong(parsed, f" from {low:g} to {high:g}")
-    return float(found[0])
+    return float(one[0])
 
 
 def _wrong(parsed: ParsedOperation, bounds: str = "") -> SplatError:

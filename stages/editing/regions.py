@@ -60,12 +60,12 @@ def _inside_lasso(view: NDArray[np.float64], corners: NDArray[np.float64]) -> In
     def inside(at: NDArray[np.float64]) -> NDArray[np.bool_]:
         x, y, z = at.T
         u, v, depth = (a * x + b * y + c * z + d for a, b, c, d in view.reshape(3, 4))
-        found = np.zeros(len(at), bool)
+        inside_lasso = np.zeros(len(at), bool)
         with np.errstate(divide="ignore", invalid="ignore"):
             u, v = u / depth, v / depth
             for (ax, ay), (bx, by) in zip(corners, np.roll(corners, 1, axis=0), strict=True):
                 passed = u < (bx - ax) * (v - ay) / (by - ay) + ax
-                found ^= ((ay > v) != (by > v)) & passed
-        return np.asarray(found & (depth > 0))
+                inside_lasso ^= ((ay > v) != (by > v)) & passed
+        return np.asarray(inside_lasso & (depth > 0))
 
     return inside

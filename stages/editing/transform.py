@@ -34,9 +34,9 @@ class Similarity:
     def inverse_matrix(self) -> NDArray[np.float64]:
         """[4, 4] takes transformed points back."""
         linear = self.rotation.T / self.scale
-        found = np.eye(4)
-        found[:3, :3], found[:3, 3] = linear, -linear @ self.offset
-        return found
+        inverse = np.eye(4)
+        inverse[:3, :3], inverse[:3, 3] = linear, -linear @ self.offset
+        return inverse
 
     def after(self, first: Similarity) -> Similarity:
         """The transform that applies `first` and then this one."""

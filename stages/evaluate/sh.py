@@ -37,8 +37,7 @@ def sufficient_degrees(splats: Splats, threshold: float) -> NDArray[np.uint8]:
     more than `threshold` (see `truncation_rms`); never above its own. Splats whose values are not
     finite keep their degree."""
     needed = (~(truncation_rms(splats) <= threshold)).sum(axis=1)
-    found: NDArray[np.uint8] = np.minimum(needed, splats.sh_degrees).astype(np.uint8)
-    return found
+    return np.asarray(np.minimum(needed, splats.sh_degrees).astype(np.uint8))
 
 
 def truncate_sh(splats: Splats, degrees: NDArray[np.uint8]) -> Splats:

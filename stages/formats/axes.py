@@ -27,20 +27,20 @@ def smallest_rotations(splats: Splats) -> Splats:
     for rows in row_slices(len(splats)):
         rotations = unit_quaternions(splats.quaternions[rows]).astype(np.float64)
         least = np.abs(rotations @ (cube * (1, -1, -1, -1)).T).argmax(axis=1)
-        found = _product(rotations, cube[least])
-        quaternions[rows] = np.where(found[:, :1] < 0, -found, found)
+        smallest = _product(rotations, cube[least])
+        quaternions[rows] = np.where(smallest[:, :1] < 0, -smallest, smallest)
         log_scales[rows] = np.take_along_axis(splats.log_scales[rows], axes[least], axis=1)
     return replace(splats, quaternions=quaternions, log_scales=log_scales)
 
 
 def _cube_rotations() -> NDArray[np.float64]:
     """[24, 4] the rotations of a cube as unit quaternions."""
-    found = []
+    rotations = []
     for ends in product((0, 1, -1), repeat=4):
         used = [end for end in ends if end]
         if len(used) in (1, 2, 4) and used[0] > 0:
-            found.append(np.array(ends) / np.sqrt(len(used)))
-    return np.array(found)
+            rotations.append(np.array(ends) / np.sqrt(len(used)))
+    return np.array(rotations)
 
 
 def _product(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:

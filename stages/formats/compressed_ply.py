@@ -104,8 +104,7 @@ def outlier_shells(means: NDArray[np.floating]) -> NDArray[np.int64]:
 def _visibility(splats: Splats) -> NDArray[np.float64]:
     """[N] logarithm of opacity times the area of the largest side."""
     area = np.sort(splats.log_scales, axis=1)[:, 1:].sum(axis=1, dtype=np.float64)
-    visibility: NDArray[np.float64] = area - np.logaddexp(0, -splats.opacity_logits)
-    return visibility
+    return np.asarray(area - np.logaddexp(0, -splats.opacity_logits))
 
 
 def _header_text(splats: Splats, degree: int, units: str) -> bytes:
@@ -283,5 +282,4 @@ def _sh_values(rows: NDArray[Any]) -> NDArray[np.float32]:
     levels[[0, 255]] = (0.0, 1.0)
     values = ((levels - 0.5) * 2 * SH_LIMIT).astype(np.float32)
     steps = np.stack([rows[name] for name in rows.dtype.names or ()], axis=1)
-    found: NDArray[np.float32] = values[steps].reshape(len(rows), 3, -1).transpose(0, 2, 1)
-    return found
+    return np.asarray(values[steps].reshape(len(rows), 3, -1).transpose(0, 2, 1))

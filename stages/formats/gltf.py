@@ -78,14 +78,14 @@ def attributes(
 
 def _sh_attributes(splats: Splats) -> dict[str, Attribute]:
     """The SH attributes of `splats` (y down), float32 as the specification requires."""
-    found = {}
+    attributes = {}
     for degree in range(splats.sh_degree + 1):
         for i in range(2 * degree + 1):
             k = degree * degree + i
             rows = splats.sh[:, k].astype("<f4", copy=False)
             name = f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{i}"
-            found[name] = Attribute(rows, 3, negated=SH_SIGNS[k] < 0)
-    return found
+            attributes[name] = Attribute(rows, 3, negated=SH_SIGNS[k] < 0)
+    return attributes
 
 
 def fallback_colours(splats: Splats, opacities: NDArray[np.float32]) -> NDArray[np.floating]:

@@ -175,7 +175,7 @@ def _nodes(document: dict[str, Any]) -> list[_Placed]:
     waiting: list[tuple[Any, NDArray[np.float64]]] = [
         (index, np.eye(4)) for index in reversed(roots)
     ]
-    found: list[_Placed] = []
+    placed: list[_Placed] = []
     seen: set[int] = set()
     while waiting:
         index, parent = waiting.pop()
@@ -184,9 +184,9 @@ def _nodes(document: dict[str, Any]) -> list[_Placed]:
             raise BadFileError("a node has two parents")
         seen.add(index)
         matrix = parent @ _matrix_of(node)
-        found.append((node, matrix))
+        placed.append((node, matrix))
         waiting += [(child, matrix) for child in reversed(_list(node, "children"))]
-    return found
+    return placed
 
 
 def _matrix_of(node: dict[str, Any]) -> NDArray[np.float64]:
@@ -329,5 +329,5 @@ def _list(holder: dict[str, Any], key: str) -> list[Any]:
 def _item(items: list[Any], index: Any, what: str) -> dict[str, Any]:
     if type(index) is not int or not 0 <= index < len(items) or not isinstance(items[index], dict):
         raise BadFileError(f"it refers to {what} {str(index)[:40]}, which it does not hold")
-    found: dict[str, Any] = items[index]
-    return found
+    item: dict[str, Any] = items[index]
+    return item

@@ -29,8 +29,7 @@ def join(largest: NDArray[np.integer], others: NDArray[np.floating]) -> NDArray[
     quaternions[rows[:, None], _columns(largest)] = exact
     quaternions[rows, largest] = np.sqrt(np.maximum(0.0, 1.0 - np.square(exact).sum(axis=1)))
     norms = np.linalg.norm(quaternions, axis=1, keepdims=True)
-    found: NDArray[np.float32] = (quaternions / norms).astype(np.float32)
-    return found
+    return np.asarray((quaternions / norms).astype(np.float32))
 
 
 def fractions_of(others: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -46,5 +45,4 @@ def from_fractions(fractions: NDArray[np.floating]) -> NDArray[np.floating]:
 def _columns(largest: NDArray[np.integer]) -> NDArray[np.intp]:
     """[N, 3] the indices of the other components, ascending."""
     table = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]], np.intp)
-    found: NDArray[np.intp] = table[largest]
-    return found
+    return np.asarray(table[largest])

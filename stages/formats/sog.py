@@ -43,9 +43,9 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
     Positions stay relative to `splats.origin`, which meta.json holds. Raises SplatError when the
     file cannot be written.
     """
-    found = sog_members(splats, morton.morton_order(splats), units)
+    members = sog_members(splats, morton.morton_order(splats), units)
     with replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as package:
-        for name, content in found.items():
+        for name, content in members.items():
             _add(package, name, content)
 
 

@@ -52,10 +52,10 @@ def quantise_for_sog(splats: Splats, bits: BitDepths) -> Splats:
 
 def quantise_splats(splats: Splats, bits: BitDepths) -> Splats:
     """As `quantise_for_sog`, without permuting the axes of the ellipsoids."""
-    exact = found = splats
+    exact = quantised = splats
     for name, count in asdict(bits).items():
-        found = quantise_attribute(exact, found, name, count)
-    return found
+        quantised = quantise_attribute(exact, quantised, name, count)
+    return quantised
 
 
 def quantise_attribute(exact: Splats, splats: Splats, name: str, bits: int) -> Splats:
@@ -118,8 +118,7 @@ def _rotations(quaternions: NDArray[np.floating], bits: int) -> NDArray[np.float
 
 def _by_codebook(values: NDArray[np.floating], bits: int) -> NDArray[np.float32]:
     book = codebook.scalar_codebook(values, 1 << bits)
-    found: NDArray[np.float32] = book[codebook.nearest(book, values)].astype(np.float32)
-    return found
+    return np.asarray(book[codebook.nearest(book, values)].astype(np.float32))
 
 
 def _by_palette(rest: NDArray[np.floating], bits: int) -> NDArray[np.float32]:

@@ -125,8 +125,7 @@ def _opacities(splats: Splats) -> NDArray[np.uint8]:
 
 
 def _byte(values: NDArray[np.floating]) -> NDArray[np.uint8]:
-    found: NDArray[np.uint8] = np.clip(np.rint(values), 0, 255).astype(np.uint8)
-    return found
+    return np.asarray(np.clip(np.rint(values), 0, 255).astype(np.uint8))
 
 
 def _pack_rotations(quaternions: NDArray[np.floating]) -> NDArray[np.uint32]:

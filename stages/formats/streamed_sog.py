@@ -161,9 +161,9 @@ def _free_folders(path: Path, names: Sequence[str]) -> list[Path]:
     that nothing has their names."""
     for first in itertools.count():
         parts = (name.partition("/")[0].split("_") for name in names)
-        found = [path.with_name(f"{level}_{int(number) + first}") for level, number in parts]
-        if not any(os.path.lexists(folder) for folder in found):
-            return found
+        folders = [path.with_name(f"{level}_{int(number) + first}") for level, number in parts]
+        if not any(os.path.lexists(folder) for folder in folders):
+            return folders
     raise AssertionError
 
 
@@ -310,26 +310,26 @@ def _leaf_lods(tree: Any) -> Iterator[dict[str, Any]]:
 
 def _finest(tree: dict[str, Any], files: int) -> dict[int, list[tuple[int, int]]]:
     """By chunk: (offset, count) of its rows in the finest level, ascending."""
-    found: dict[int, list[tuple[int, int]]] = {}
+    rows_of: dict[int, list[tuple[int, int]]] = {}
     for lods in _leaf_lods(tree):
         at = lods[min(lods, key=int)]
         file = whole(at, "file", most=files - 1)
-        found.setdefault(file, []).append((whole(at, "offset"), whole(at, "count")))
-    return {file: sorted(ranges) for file, ranges in found.items()}
+        rows_of.setdefault(file, []).append((whole(at, "offset"), whole(at, "count")))
+    return {file: sorted(ranges) for file, ranges in rows_of.items()}
 
 
 def parts_of(path: Path) -> dict[str, Path]:
     """By path relative to the folder: the asset and all files of its chunks. Raises SplatError
     "splats-unreadable"."""
-    found = {path.name: path}
+    parts = {path.name: path}
     with reading(path):
         meta = json.loads(path.read_text(encoding="utf-8"))
         for name in [*meta["filenames"], *filter(None, [meta.get("environment")])]:
             place = _place(path.parent, name)
             chunk = place.parent.iterdir() if place.name == "meta.json" else [place]
             files = (file for file in chunk if file.is_file())
-            found |= {file.relative_to(path.parent).as_posix(): file for file in files}
-    return found
+            parts |= {file.relative_to(path.parent).as_posix(): file for file in files}
+    return parts
 
 
 def splat_widths(path: Path, finest: Splats) -> list[float]:

@@ -133,8 +133,7 @@ def _extent(splats: Splats) -> NDArray[np.float32]:
         low = np.minimum(low, (block.means - reach).min(axis=0))
         high = np.maximum(high, (block.means + reach).max(axis=0))
     most = np.finfo(np.float32).max
-    found: NDArray[np.float32] = np.clip(np.stack([low, high]), -most, most).astype(np.float32)
-    return found
+    return np.asarray(np.clip(np.stack([low, high]), -most, most).astype(np.float32))
 
 
 def _reach(unit: NDArray[np.float32], scales: NDArray[np.float32]) -> NDArray[np.float64]:

@@ -225,8 +225,8 @@ def main(arguments: list[str]) -> int:
     try:
         if arguments[2:] == [_UNITS]:
             with accepted_path(source) as name:
-                found = str(_note(_open(name)).get("units", ""))
-            output.write_text(found, encoding="utf-8")
+                units = str(_note(_open(name)).get("units", ""))
+            output.write_text(units, encoding="utf-8")
             return 0
         with nonfinite_allowed() if arguments[2:] else nullcontext():
             splats = parse(source)

@@ -58,22 +58,22 @@ TEXTS = {  # by code, in the order of the warnings; {names} of files or photogra
 }
 
 
-def unused_files(found: Findings) -> dict[str, Sequence[str]]:
+def unused_files(files: Findings) -> dict[str, Sequence[str]]:
     """Names of the files that ingest does not use, by the code of their warning."""
     return {
-        "ingest-raw-not-read": found.raws,
-        "ingest-format-not-read": found.other_pictures,
-        "ingest-beside-frames": found.beside_frames,
-        "ingest-mask-unused": found.stray_masks,
-        "ingest-depth-unused": found.stray_depths,
+        "ingest-raw-not-read": files.raws,
+        "ingest-format-not-read": files.other_pictures,
+        "ingest-beside-frames": files.beside_frames,
+        "ingest-mask-unused": files.stray_masks,
+        "ingest-depth-unused": files.stray_depths,
     }
 
 
 def about_names(names: Mapping[str, Sequence[str]], warn: Warn) -> None:
     """Warn with the text of each code for which there are names."""
     for code, text in TEXTS.items():
-        if found := names.get(code):
-            warn(code, text.format(names=listed(found)))
+        if named := names.get(code):
+            warn(code, text.format(names=listed(named)))
 
 
 LEFT_OUT = {  # by code: what becomes of the first files that cannot be used, and of the others

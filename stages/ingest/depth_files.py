@@ -68,16 +68,16 @@ def pair_depths(
         unit: see `DepthFile`.
     """
     left = {_of_frame(name): path for name, path in maps.items()}
-    found: dict[str, DepthFile] = {}
+    maps_of: dict[str, DepthFile] = {}
     names = list(photographs)
     while more := pair_masks(names, left, "_depth"):
         for name, path in more.items():
-            first = found.get(name, DepthFile(path, unit))
-            others = (*first.others, path) if name in found else ()
-            found[name] = DepthFile(first.path, unit, others)
+            first = maps_of.get(name, DepthFile(path, unit))
+            others = (*first.others, path) if name in maps_of else ()
+            maps_of[name] = DepthFile(first.path, unit, others)
         used = set(more.values())
         left = {name: path for name, path in left.items() if path not in used}
-    return found
+    return maps_of
 
 
 def needs_no_photograph(name: str, files: Container[str]) -> bool:
@@ -104,14 +104,14 @@ def is_confidence(name: str) -> bool:
 def confidence_of(path: Path) -> Path | None:
     """The file that says how confident a map is, if there is one."""
     beside = path.with_name(path.name.replace("depth_", "conf_", 1))
-    found = (path.parent.with_name(CONFIDENCE) / path.name, beside)
-    return next((file for file in found if file != path and file.is_file()), None)
+    candidates = (path.parent.with_name(CONFIDENCE) / path.name, beside)
+    return next((file for file in candidates if file != path and file.is_file()), None)
 
 
-def check_paired(found: Findings, chosen: Path | None) -> None:
+def check_paired(files: Findings, chosen: Path | None) -> None:
     """Raises SplatError "depth-missing" if nothing in `chosen` is the map of a photograph."""
-    if chosen is not None and not found.depths:
-        photograph = (found.sources or found.videos)[0].name
+    if chosen is not None and not files.depths:
+        photograph = (files.sources or files.videos)[0].name
         raise SplatError(
             "depth-missing",
             given=f"{chosen} holds no depth map of a photograph such as {photograph}.",

@@ -66,7 +66,7 @@ def find(folder: Path, more_masks: Path | None = None, depth: Path | None = None
         for kind, suffixes in (("video", VIDEO), ("raw", RAW), ("other", OTHER_PICTURES))
     }
     images = picture_names([*photographs, *kinds["video"]])
-    found = Findings(
+    findings = Findings(
         sources=tuple(Source(files[name], name, images[name]) for name in photographs),
         videos=tuple(Source(files[name], name, images[name]) for name in kinds["video"]),
         raws=kinds["raw"],
@@ -79,9 +79,9 @@ def find(folder: Path, more_masks: Path | None = None, depth: Path | None = None
         stray_depths=stray_depths,
         beside_frames=beside_frames,
     )
-    if not found.sources and not found.videos:
-        raise _no_photographs(folder, found)
-    return found
+    if not findings.sources and not findings.videos:
+        raise _no_photographs(folder, findings)
+    return findings
 
 
 def _posed(folder: Path, pictures: list[str]) -> list[str]:
@@ -120,7 +120,7 @@ def _remove_masks(
     }
     if len(inside) == len(files):
         inside = {}  # a folder of nothing but masks holds photographs
-    found = {short: files.pop(name) for name, short in inside.items()}
+    apart_masks = {short: files.pop(name) for name, short in inside.items()}
     if apart is not None and apart.is_dir() and apart != photos:
         every = _files_by_name(apart)
         if photos.is_relative_to(apart):  # masks lie above the photographs, not among them
@@ -129,15 +129,17 @@ def _remove_masks(
             inside_it = [n for n, p in files.items() if p.resolve().is_relative_to(apart)]
             for name in inside_it:
                 del files[name]
-        found |= every
-    found = {name: path for name, path in found.items() if suffix_of(name) in masks.MASK_SUFFIXES}
+        apart_masks |= every
+    apart_masks = {
+        name: path for name, path in apart_masks.items() if suffix_of(name) in masks.MASK_SUFFIXES
+    }
     pictures = [name for name in files if suffix_of(name) in PICTURES]
     beside = masks.masks_beside(pictures)
-    paired = masks.pair_masks((name for name in pictures if name not in beside), found)
+    paired = masks.pair_masks((name for name in pictures if name not in beside), apart_masks)
     for mask, photograph in beside.items():
         paired.setdefault(photograph, files.pop(mask))
     used = set(paired.values())
-    stray = (name for name, path in found.items() if path not in used)
+    stray = (name for name, path in apart_masks.items() if path not in used)
     return paired, tuple(sorted(stray, key=natural_key))
 
 
@@ -200,7 +202,7 @@ def _walk(folder: Path) -> Iterable[Path]:
 
 def _not_files(folder: Path) -> dict[str, str]:
     """See `Findings.not_files`."""
-    found = {}
+    reasons = {}
     for place, folders, files in os.walk(folder):
         folders[:] = [name for name in folders if not _is_hidden(name)]
         for path in (Path(place, name) for name in (*folders, *files) if not _is_hidden(name)):
@@ -210,8 +212,8 @@ def _not_files(folder: Path) -> dict[str, str]:
             elif not path.is_file():
                 why = "it is a broken link" if path.is_symlink() else "it is a pipe or a device"
             if why:
-                found[printable_name(path.relative_to(folder).as_posix())] = why
-    return found
+                reasons[printable_name(path.relative_to(folder).as_posix())] = why
+    return reasons
 
 
 def _is_hidden(name: str) -> bool:
@@ -240,13 +242,13 @@ def _check_folder(folder: Path) -> None:
     )
 
 
-def _no_photographs(folder: Path, found: Findings) -> SplatError:
+def _no_photographs(folder: Path, findings: Findings) -> SplatError:
     wanted = "JPEG, PNG, TIFF, WebP or HEIC photographs, at least 3; 20 to 50 do an object well."
     counts = {
-        "raw file": len(found.raws),
-        "picture": len(found.other_pictures),
-        "other file": found.others,
-        "link, pipe or device": len(found.not_files),
+        "raw file": len(findings.raws),
+        "picture": len(findings.other_pictures),
+        "other file": findings.others,
+        "link, pipe or device": len(findings.not_files),
     }
     if not any(counts.values()):
         return SplatError(
@@ -257,9 +259,9 @@ def _no_photographs(folder: Path, found: Findings) -> SplatError:
         )
     kinds = [counted(count, kind) for kind, count in counts.items() if count]
     hint = "Name the folder that holds the photographs."
-    if found.raws:
+    if findings.raws:
         hint = RAW_ADVICE
-    elif found.other_pictures:
+    elif findings.other_pictures:
         hint = "Save the pictures as JPEG or PNG first."
     return SplatError(
         "ingest-no-photographs",

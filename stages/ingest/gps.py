@@ -58,7 +58,7 @@ def read_gps(tags: dict[int, Any], xmp: bytes) -> Gps:
 
 def _from_exif(tags: dict[int, Any]) -> Gps:
     """The position; none at 0, 0 either, which receivers without a fix write."""
-    found = []
+    angles = []
     for reference, number in ((1, 2), (3, 4)):
         sign = {"N": 1, "E": 1, "S": -1, "W": -1}.get(text_of(tags.get(reference)).upper()[:1])
         try:
@@ -68,11 +68,11 @@ def _from_exif(tags: dict[int, Any]) -> Gps:
         value = degrees + minutes / 60 + seconds / 3600
         if sign is None or not value >= 0:
             return Gps()
-        found.append(sign * value)
+        angles.append(sign * value)
     side = tags.get(5)  # a byte, which some programs write as text
     below = side in (1, 3) or text_of(side) in ("\1", "\3", "1", "3")
     height = number_of(tags.get(6))
-    return _checked(found[0], found[1], -height if height is not None and below else height)
+    return _checked(angles[0], angles[1], -height if height is not None and below else height)
 
 
 def _from_dji(xmp: bytes) -> Gps:

@@ -30,11 +30,11 @@ def check_rig_mask(file: Path | None) -> None:
         )
 
 
-def check_pairing(found: Findings, apart: Path | None, chosen: Path | None) -> None:
+def check_pairing(files: Findings, apart: Path | None, chosen: Path | None) -> None:
     """Check that masks which were given belong to photographs.
 
     Args:
-        found: what the capture's folder holds.
+        files: what the capture's folder holds.
         apart: the folder of masks that was searched: `chosen`, or one found beside.
         chosen: the folder that was given as a setting.
 
@@ -42,16 +42,16 @@ def check_pairing(found: Findings, apart: Path | None, chosen: Path | None) -> N
         SplatError: "masks-missing" if `chosen` holds none, "masks-of-others" if no mask belongs to
             a photograph by its name.
     """
-    if found.masks or (chosen is None and (apart is not None or not found.stray_masks)):
+    if files.masks or (chosen is None and (apart is not None or not files.stray_masks)):
         return
-    if chosen is not None and not found.stray_masks:
+    if chosen is not None and not files.stray_masks:
         raise SplatError(
             "masks-missing",
             given=f"{chosen} holds no masks of photographs.",
             wanted="A folder of grey pictures, named as the photographs are.",
             hint="Check the path.",
         )
-    photograph, mask = (found.sources or found.videos)[0].name, found.stray_masks[0]
+    photograph, mask = (files.sources or files.videos)[0].name, files.stray_masks[0]
     stem = PurePosixPath(photograph).stem
     raise SplatError(
         "masks-of-others",
@@ -86,34 +86,34 @@ def pair_masks(
         ending: see `names_for`.
     """
     photographs = list(photographs)
-    found: dict[str, Path] = {}
+    mask_of: dict[str, Path] = {}
     for fold in (str, str.casefold):
-        used = set(found.values())
+        used = set(mask_of.values())
         left = {name: path for name, path in sorted(masks.items()) if path not in used}
         by_stem = {fold(_stem(name)): path for name, path in left.items()}
         for name in photographs:
             keys = [key for key in map(fold, names_for(name, ending)) if key in by_stem]
-            if keys and name not in found:
-                found[name] = by_stem[keys[0]]
+            if keys and name not in mask_of:
+                mask_of[name] = by_stem[keys[0]]
     bare = [PurePosixPath(name).name for name in photographs]
-    if not found and len({name.casefold() for name in bare}) == len(bare):
+    if not mask_of and len({name.casefold() for name in bare}) == len(bare):
         short = {PurePosixPath(name).name: path for name, path in sorted(masks.items())}
         if short != dict(masks) or bare != photographs:
             again = pair_masks(bare, short, ending)
-            found = {
+            mask_of = {
                 name: again[last]
                 for name, last in zip(photographs, bare, strict=True)
                 if last in again
             }
-    return found
+    return mask_of
 
 
 def masks_beside(photographs: Iterable[str]) -> dict[str, str]:
     """Files of a folder that are masks of others there (a.jpg.png or a_mask.png beside a.jpg): the
     photograph's name by the mask's."""
     photographs = list(photographs)
-    found: dict[str, str] = {}
+    photograph_of: dict[str, str] = {}
     for fold in (str.casefold, str):  # the second is closer
         keys = {fold(key): name for name in photographs for key in names_for(name)[::2]}
-        found |= {n: keys[fold(_stem(n))] for n in photographs if fold(_stem(n)) in keys}
-    return found
+        photograph_of |= {n: keys[fold(_stem(n))] for n in photographs if fold(_stem(n)) in keys}
+    return photograph_of

@@ -37,12 +37,12 @@ STITCH = (
 def projection_of(xmp: bytes) -> str:
     """GPano's ProjectionType in lower case ("equirectangular"), with "partial" before it if the
     picture shows a part of the circle; "" if there is none."""
-    found = re.search(_TAG % b"ProjectionType", xmp)
-    if not found:
+    tag = re.search(_TAG % b"ProjectionType", xmp)
+    if not tag:
         return ""
     whole, cropped = (re.search(_TAG % name, xmp) for name in _WIDTHS)
     part = "partial " if whole and cropped and whole[1] != cropped[1] else ""
-    return part + found[1].decode("ascii").lower()
+    return part + tag[1].decode("ascii").lower()
 
 
 def panorama(pixels: NDArray[np.uint8], stored: tuple[int, int], projection: str) -> str:

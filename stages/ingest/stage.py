@@ -152,35 +152,35 @@ def _remarks(
     }
 
 
-def _masks_cut_out(found: Findings, settings: IngestSettings) -> bool:
+def _masks_cut_out(files: Findings, settings: IngestSettings) -> bool:
     """Whether mask files cut out an object, and --mask-means does not say otherwise.
 
     All photographs must have masks; one without a mask would show everything around the object.
     """
-    masks = [found.masks[one.name] for one in found.sources if one.name in found.masks]
-    decided = settings.mask_means != AUTO or bool(found.videos)
+    masks = [files.masks[one.name] for one in files.sources if one.name in files.masks]
+    decided = settings.mask_means != AUTO or bool(files.videos)
     return (
         not decided
-        and len(masks) == len(found.sources)
+        and len(masks) == len(files.sources)
         and cuts_out_object(masks, settings.invert_masks)
     )
 
 
 def _ingest_photographs(
-    found: Findings, settings: IngestSettings, folder: Path, report: Report
+    files: Findings, settings: IngestSettings, folder: Path, report: Report
 ) -> list[_Ingested]:
     """All photographs, in order; a few are read at once."""
     budget = PixelBudget(_PIXELS_AT_ONCE)
     ingested: list[_Ingested] = []
-    total = len(found.sources)
+    total = len(files.sources)
     report.progress(0, total, "reading photographs")
     with readers_set_up(), ThreadPoolExecutor(threads.count()) as pool:
         futures: list[Future[_Ingested]] = [
-            pool.submit(_ingest_photograph, source, found, settings, folder, budget)
-            for source in found.sources
+            pool.submit(_ingest_photograph, source, files, settings, folder, budget)
+            for source in files.sources
         ]
         try:
-            for done, (source, future) in enumerate(zip(found.sources, futures, strict=True), 1):
+            for done, (source, future) in enumerate(zip(files.sources, futures, strict=True), 1):
                 ingested.append(future.result())
                 report.progress(done, total, source.name)
                 if report.stop_requested.is_set() and done < total:
@@ -191,7 +191,7 @@ def _ingest_photographs(
 
 
 def _ingest_photograph(
-    source: Source, found: Findings, settings: IngestSettings, folder: Path, budget: PixelBudget
+    source: Source, files: Findings, settings: IngestSettings, folder: Path, budget: PixelBudget
 ) -> _Ingested:
     try:
         decoded = decode(source.path, settings.max_side, budget)
@@ -200,12 +200,12 @@ def _ingest_photograph(
             decoded = decode(source.path, int(faces.WIDTHS * settings.max_side), budget)
         elif kind:
             raise Unusable(f"it is {kind}", hint_for(kind))
-        mask = found.masks.get(source.name)
+        mask = files.masks.get(source.name)
         picture = _Picture(source.name, source.image, decoded, mask, sphere=kind == SPHERE)
         done = _write(picture, settings, folder)
     except Unusable as error:
         return _Ingested(source.name, error=error)
-    depth = found.depths.get(source.name)
+    depth = files.depths.get(source.name)
     return done if depth is None else _with_depth(done, depth, decoded, folder)
 
 

@@ -106,10 +106,10 @@ def _warn_of_gaps(covered: float, report: Report) -> None:
 
 def _covered(mesh: Mesh, maps: list[DepthMap], voxel: float) -> float:
     """`covered_share` of CollisionMesh."""
-    pixels = sum(int((found.depth > 0).sum()) for found in maps)
+    pixels = sum(int((drawn.depth > 0).sum()) for drawn in maps)
     step = max(1, pixels // _SAMPLES)
-    solid = [replace(found, weight=(found.depth > 0).astype(np.float32)) for found in maps]
-    places = np.concatenate([found.points(step) for found in solid])
+    solid = [replace(drawn, weight=(drawn.depth > 0).astype(np.float32)) for drawn in maps]
+    places = np.concatenate([drawn.points(step) for drawn in solid])
     on_mesh = _surface_samples(mesh, voxel)
     near = cKDTree(on_mesh).query(places, distance_upper_bound=_COVERED_VOXELS * voxel)[0] < np.inf
     return round(float(near.mean()), 4)

@@ -46,8 +46,7 @@ def unproject(camera: Camera, depth: NDArray[np.floating]) -> NDArray[np.float64
     """[H, W, 3] positions of all pixel centres in the axes of the camera."""
     rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
     x, y = (columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy
-    found: NDArray[np.float64] = np.stack([x, y, np.ones_like(x)], axis=-1) * depth[..., None]
-    return found
+    return np.asarray(np.stack([x, y, np.ones_like(x)], axis=-1) * depth[..., None])
 
 
 def select_cameras(cameras: list[Camera]) -> list[Camera]:

@@ -50,7 +50,7 @@ def observed_box(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
     """Corners (low [3], high [3]) of the box that holds most pixels with a weight; None if there
     are none. Percentiles keep a single far splat from enlarging the voxels."""
-    sampled = [found.depth[found.weight > 0][::_SAMPLE_STEP] for found in maps]
+    sampled = [depth_map.depth[depth_map.weight > 0][::_SAMPLE_STEP] for depth_map in maps]
     if not any(map(len, sampled)):
         return None
     depths = np.concatenate(sampled)
@@ -74,12 +74,12 @@ def fuse_depth_maps(maps: list[DepthMap], volume: Volume, near: float) -> Volume
     Every voxel adds the maps in their order, so the result does not depend on threads.
     """
     rows, start = np.zeros((len(maps), CAMERA_ROW)), 0
-    for row, found in zip(rows, maps, strict=True):
-        camera = found.camera
+    for row, depth_map in zip(rows, maps, strict=True):
+        camera = depth_map.camera
         row[:12] = camera.world_to_camera[:3].ravel()
         row[12:18] = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
         row[18] = start
-        start += found.depth.size
+        start += depth_map.depth.size
     default_pool().share(
         integrate,
         volume.distance,
@@ -89,8 +89,8 @@ def fuse_depth_maps(maps: list[DepthMap], volume: Volume, near: float) -> Volume
         TRUNCATION * volume.voxel,
         near,
         rows,
-        np.concatenate([found.depth.ravel() for found in maps]),
-        np.concatenate([found.weight.ravel() for found in maps]),
+        np.concatenate([depth_map.depth.ravel() for depth_map in maps]),
+        np.concatenate([depth_map.weight.ravel() for depth_map in maps]),
     )
     np.multiply(volume.distance, np.float32(TRUNCATION), out=volume.distance)
     return volume

@@ -20,16 +20,16 @@ def colour_vertices(mesh: Mesh, maps: list[DepthMap], tolerance: float) -> Mesh:
     if not len(mesh.vertices):
         return mesh
     sums, weights = np.zeros((len(mesh.vertices), 3)), np.zeros(len(mesh.vertices))
-    for found in maps:
-        camera = found.camera
+    for depth_map in maps:
+        camera = depth_map.camera
         pixels, z = camera.project(mesh.vertices.astype(np.float64))
         inside = (z > 0) & camera.shows(pixels)
         columns, rows = pixels[inside].astype(int).T
-        agrees = np.abs(found.depth[rows, columns] - z[inside]) < tolerance
+        agrees = np.abs(depth_map.depth[rows, columns] - z[inside]) < tolerance
         seen = np.flatnonzero(inside)[agrees]
         rows, columns = rows[agrees], columns[agrees]
-        weight = found.weight[rows, columns].astype(np.float64)
-        sums[seen] += weight[:, None] * found.colour[rows, columns]
+        weight = depth_map.weight[rows, columns].astype(np.float64)
+        sums[seen] += weight[:, None] * depth_map.colour[rows, columns]
         weights[seen] += weight
     known = weights > 0
     if not known.any():

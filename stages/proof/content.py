@@ -38,8 +38,7 @@ class FileContent:
 def logits(p: NDArray[np.floating]) -> NDArray[np.float64]:
     """Logits of opacities, which are kept away from 0 and 1."""
     inside = np.clip(p, 1e-30, 1 - 1e-9, dtype=np.float64)
-    found: NDArray[np.float64] = np.log(inside / (1 - inside))
-    return found
+    return np.asarray(np.log(inside / (1 - inside)))
 
 
 def says_antialiased(comments: Iterable[str]) -> bool:

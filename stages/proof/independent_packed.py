@@ -63,8 +63,8 @@ def compressed_ply(path: Path) -> Splats:
             "sh": sh,
         }
 
-    found = splats_by_rows(data["vertex"].count, values_of)
-    return found.with_antialias(says_antialiased(data.comments))
+    splats = splats_by_rows(data["vertex"].count, values_of)
+    return splats.with_antialias(says_antialiased(data.comments))
 
 
 def spz(path: Path) -> Splats:
@@ -122,16 +122,16 @@ def streamed_sog(path: Path) -> Splats:
     meta = json.loads(path.read_text("utf-8"))
     if meta.get("environment") or not all(n.endswith("/meta.json") for n in meta["filenames"]):
         raise NotCrossCheckedError("an environment, or chunks that are not folders")
-    waiting, found = [meta["tree"]], {}
+    waiting, leaves = [meta["tree"]], {}
     while waiting:
         node = waiting.pop()
         waiting.extend(node.get("children", ()))
         if node.get("lods"):
             at = node["lods"][sorted(node["lods"], key=int)[0]]
-            found[at["file"], at["offset"]] = at["count"]
+            leaves[at["file"], at["offset"]] = at["count"]
     chunks: dict[int, Splats] = {}
     parts = []
-    for (file, offset), count in sorted(found.items()):
+    for (file, offset), count in sorted(leaves.items()):
         if file not in chunks:
             packed = io.BytesIO()
             with zipfile.ZipFile(packed, "w") as package:

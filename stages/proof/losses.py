@@ -27,21 +27,21 @@ def require_proven(path: Path, prover: Prover, code: str) -> tuple[dict[str, Any
     """(the figures of the proof of a file that was just written, `losses_of` it). Raises SplatError
     `code` if it is wrong."""
     proof = prover.require(path, code)
-    found = losses_of(path, prover.splats, proof)
-    if "drawing" not in found:
-        return proof.figures, found
+    losses = losses_of(path, prover.splats, proof)
+    if "drawing" not in losses:
+        return proof.figures, losses
     plain_db = round(prover.plain_drawing_db(), 2)
-    found["drawing"] += f" Drawn plainly, its pictures have a PSNR of {plain_db} dB."
-    return proof.figures | {"plain_drawing_db": plain_db}, found
+    losses["drawing"] += f" Drawn plainly, its pictures have a PSNR of {plain_db} dB."
+    return proof.figures | {"plain_drawing_db": plain_db}, losses
 
 
 def losses_of(path: Path, splats: Splats, proof: Proof) -> dict[str, str]:
     """`changes_shown`, and what the file has no field for, by the end of a stable code."""
-    row, name, found = format_of(path), path.name, changes_shown(path, splats, proof)
+    row, name, losses = format_of(path), path.name, changes_shown(path, splats, proof)
     if not len(splats):
-        return found
+        return losses
     if splats.draw_settings.antialias and not row.drawn_antialiased:
-        found["drawing"] = (
+        losses["drawing"] = (
             f"{name} holds splats for antialiased drawing"
             f"{'' if row.says_drawing else ', of which the file says nothing'}, and most programs "
             f"draw .{row.ending} plainly: splats look too strong there, the more the farther away. "
@@ -50,29 +50,29 @@ def losses_of(path: Path, splats: Splats, proof: Proof) -> dict[str, str]:
             f"`splat export run --format {row.ending} --drawing plain`."
         )
     if not row.holds_origin and is_located(splats):
-        found["origin"] = (
+        losses["origin"] = (
             f"{name} has no field for where the scene lies, which was written to "
             f"{offset_path(path).name}."
         )
-    return found
+    return losses
 
 
 def changes_shown(path: Path, splats: Splats, proof: Proof) -> dict[str, str]:
     """What changed visibly of the drawable `splats` in the file at `path`, by the end of a stable
     code: how much, why, and what to do. Most files hold everything."""
     row, name = format_of(path), path.name
-    found: dict[str, str] = {}
+    losses: dict[str, str] = {}
     for attribute, (code, text) in _CHANGES.items():
         if change := proof.changes.get(attribute):
             count = f"{change.count:,} of {counted(len(splats), 'splat')}"
-            found[code] = f"In {name} {count} {text(row, splats, change)}."
-    if proof.loss_db is not None and not found:
+            losses[code] = f"In {name} {count} {text(row, splats, change)}."
+    if proof.loss_db is not None and not losses:
         why = f"the format {row.loses}" if row.loses else "the original had lost more already"
-        found["lossy"] = (
+        losses["lossy"] = (
             f"Pictures of {name} have a PSNR of {proof.loss_db:.1f} dB: {why}. Where a viewer "
             "reads them, prefer .ply, .glb or .usdz."
         )
-    return found
+    return losses
 
 
 def _moved(row: Format, splats: Splats, change: Change) -> str:

@@ -97,10 +97,7 @@ def _values(splats: Splats) -> NDArray[np.float32]:
 def _unlike(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.bool_]:
     """[N] whether more than one of opacity, colour and scales differ too much."""
     far = np.abs(a - b) > 1
-    found: NDArray[np.bool_] = (
-        far[:, 0].astype(int) + far[:, 1:4].any(axis=1) + far[:, 4:].any(axis=1) > 1
-    )
-    return found
+    return np.asarray(far[:, 0].astype(int) + far[:, 1:4].any(axis=1) + far[:, 4:].any(axis=1) > 1)
 
 
 def _match_neighbours(

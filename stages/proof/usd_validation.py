@@ -19,9 +19,9 @@ def usd_errors(path: Path) -> list[str]:
     with accepted_path(path) as name:
         stage = Usd.Stage.Open(name)
         stage.Reload()  # the library's cache may hold an older file of the same name
-        found = UsdValidation.ValidationContext(validators).Validate(stage)
+        errors = UsdValidation.ValidationContext(validators).Validate(stage)
     return [
         " ".join(error.GetErrorAsString().split())
-        for error in found
+        for error in errors
         if error.GetType() == UsdValidation.ValidationErrorType.Error
     ]

@@ -42,8 +42,7 @@ def smoothing_widths(
         finest = np.minimum(finest, interval)
     known = np.isfinite(finest)
     finest[~known] = finest[known].max() if known.any() else 0.0
-    found: NDArray[np.float32] = (np.sqrt(VARIANCE) * finest).astype(np.float32)
-    return found
+    return np.asarray((np.sqrt(VARIANCE) * finest).astype(np.float32))
 
 
 def smoothed(splats: Splats, widths: NDArray[np.float32]) -> Splats:

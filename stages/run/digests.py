@@ -51,15 +51,15 @@ def record_files(
     if folder.is_file():
         name = printable_name(folder.name)
         return {name: record(folder, known.get(name))}
-    found: FileRecords = {}
+    records: FileRecords = {}
     for path in sorted(folder.rglob("*")):
         relative = path.relative_to(folder)
         if users and any(part.startswith(".") for part in relative.parts):
             continue
         name = printable_name(relative.as_posix()) if users else relative.as_posix()
         if name not in leave_out and path.is_file():
-            found[name] = record(path, known.get(name))
-    return found
+            records[name] = record(path, known.get(name))
+    return records
 
 
 def _record_if_readable(path: Path, known: FileRecord | None) -> FileRecord:

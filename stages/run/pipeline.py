@@ -113,8 +113,8 @@ class Pipeline:
                 for file, record in outputs.items()
                 if pictures or not file.lower().endswith(_PICTURES)
             }
-            if found := damage(folder, chosen, read_all=True):
-                damaged[folder] = found
+            if changes := damage(folder, chosen, read_all=True):
+                damaged[folder] = changes
         if damaged:
             what = (f"{folder.name}/{change}" for folder in damaged for change in damaged[folder])
             folders = " and ".join(shlex.quote(str(folder)) for folder in damaged)

@@ -108,19 +108,19 @@ class Planner:
         done = Manifest.read(self.layout.workspace(stage).final)
         known = done.input_files if done else {}
         named = {name: value for name, value in vars(settings).items() if isinstance(value, Path)}
-        found = {}
+        records_of = {}
         if not stage.reads:
             photos = self.existing_photos()
             if self._photo_records is None:
                 self._photo_records = record_files(photos, known.get(PHOTOS), users=True)
-            found[PHOTOS] = self._photo_records
+            records_of[PHOTOS] = self._photo_records
             folder = masks.mask_folder(photos, named.get(MASKS))
             depth = depth_files.depth_source(photos, named.get(DEPTH))
             found_beside = {MASKS: folder, DEPTH: depth}
             named |= {name: path for name, path in found_beside.items() if path is not None}
         for name, path in named.items():
             if name in known and not path.exists():
-                found[name] = known[name]
+                records_of[name] = known[name]
                 continue
             try:
                 if name == DEPTH:
@@ -131,16 +131,16 @@ class Planner:
                 # a folder that lost the files that made it one of cameras
                 if name not in known or error.code != "cameras-unknown":
                     raise
-                found[name] = known[name]
+                records_of[name] = known[name]
                 continue
-            found[name] = {}
+            records_of[name] = {}
             for file in files:  # maps of depth and of confidence have the same names
                 lead = f"{file.name}/" if file.name == depth_files.CONFIDENCE else ""
                 old = known.get(name, {}).items()
                 before = {key[len(lead) :]: one for key, one in old if key.startswith(lead)}
                 records = record_files(file, before, users=True)
-                found[name] |= {lead + key: record for key, record in records.items()}
-        return found
+                records_of[name] |= {lead + key: record for key, record in records.items()}
+        return records_of
 
     def existing_photos(self) -> Path:
         """Where the photographs are. Raises SplatError (photographs-missing)."""

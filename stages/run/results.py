@@ -74,10 +74,10 @@ def newest_splats(pipeline: Pipeline, antialias: bool = True) -> Splats:
 def reconstruction_of(pipeline: Pipeline) -> Reconstruction:
     """The capture's cameras, as training has refined them. Raises SplatError
     (stage-not-finished)."""
-    found: Reconstruction = pipeline.load("sfm")
+    reconstruction: Reconstruction = pipeline.load("sfm")
     if pipeline.manifest("train") is None or "train" in out_of_date(pipeline):
-        return found
-    return found.with_cameras(pipeline.load("train").cameras)
+        return reconstruction
+    return reconstruction.with_cameras(pipeline.load("train").cameras)
 
 
 def final_splats(pipeline: Pipeline) -> Splats:

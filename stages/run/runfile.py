@@ -61,12 +61,12 @@ class RunFile:
     ) -> dict[str, Any]:
         """Settings dataclasses of all stages: as recorded, else those in `otherwise`, else the
         defaults of the stage."""
-        found = dict(otherwise or {})
+        settings = dict(otherwise or {})
         for stage in stages:
             recorded = self.settings.get(stage.name, {})
-            if recorded or stage.name not in found:
-                found[stage.name] = settings_from_data(stage.settings_type, recorded)
-        return found
+            if recorded or stage.name not in settings:
+                settings[stage.name] = settings_from_data(stage.settings_type, recorded)
+        return settings
 
 
 def holds_stages(folder: Path) -> bool:

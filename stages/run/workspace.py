@@ -105,15 +105,15 @@ class Workspace:
         except SplatError:
             manifest = None
         outputs = manifest.outputs if manifest else {}
-        found = {}
+        new_names = {}
         for path in sorted(old.rglob("*")):
             name = path.relative_to(old).as_posix()
             if name in BOOKKEEPING or (path.is_dir() and not path.is_symlink()):
                 continue
             if name not in outputs or damage(old, {name: outputs[name]}):
                 own = manifest and name not in outputs and not os.path.lexists(new / name)
-                found[name] = name if own else _free_name(new, f"{KEPT}/{name}")
-        return found
+                new_names[name] = name if own else _free_name(new, f"{KEPT}/{name}")
+        return new_names
 
     def _replace(self) -> None:
         for name in BOOKKEEPING - {MANIFEST}:

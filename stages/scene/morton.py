@@ -40,10 +40,9 @@ def _ranks(values: NDArray[np.floating]) -> NDArray[np.uint64]:
     """[N] rank of each value among the distinct ones, scaled to the bits of one axis."""
     distinct, place = np.unique(values, return_inverse=True)
     last = max(1, len(distinct) - 1)
-    found: NDArray[np.uint64] = (
-        place.reshape(-1).astype(np.uint64) * np.uint64((1 << BITS) - 1)
-    ) // np.uint64(last)
-    return found
+    return np.asarray(
+        (place.reshape(-1).astype(np.uint64) * np.uint64((1 << BITS) - 1)) // np.uint64(last)
+    )
 
 
 def _spread(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:

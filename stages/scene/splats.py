@@ -87,8 +87,7 @@ class Splats:
     def opacities(self) -> NDArray[np.floating]:
         """[N] in [0, 1]."""
         with np.errstate(over="ignore"):
-            found: NDArray[np.floating] = 1.0 / (1.0 + np.exp(-self.opacity_logits))
-            return found
+            return np.asarray(1.0 / (1.0 + np.exp(-self.opacity_logits)))
 
     def take(self, index: NDArray[np.integer] | NDArray[np.bool_] | slice) -> Splats:
         """The rows named by an index, a mask or a slice."""
@@ -172,8 +171,7 @@ def rgb_to_dc(rgb: NDArray[np.floating]) -> NDArray[np.floating]:
 
 def dc_to_rgb(dc: NDArray[np.floating]) -> NDArray[np.floating]:
     """View-independent colour of DC coefficients, not clamped above."""
-    found: NDArray[np.floating] = np.maximum(0.0, 0.5 + SH_C0 * dc)
-    return found
+    return np.asarray(np.maximum(0.0, 0.5 + SH_C0 * dc))
 
 
 def logit(p: NDArray[np.floating] | float) -> NDArray[np.floating]:

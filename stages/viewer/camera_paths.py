@@ -31,8 +31,10 @@ def tour(cameras: Sequence[Camera], splats: Splats) -> NDArray[np.int64]:
     apart = _lengths(keys[:, None], keys[None], _subject_distance(cameras, splats))
     given = np.arange(len(keys))
     tours = [_nearest_neighbour(apart, start) for start in evenly_spaced(range(len(keys)), _STARTS)]
-    found = min(tours, key=lambda order: _path_length(order, apart))
-    return given if _path_length(given, apart) <= _DETOUR * _path_length(found, apart) else found
+    shortest = min(tours, key=lambda order: _path_length(order, apart))
+    return (
+        given if _path_length(given, apart) <= _DETOUR * _path_length(shortest, apart) else shortest
+    )
 
 
 def interpolated(cameras: Sequence[Camera], splats: Splats, frames: int) -> tuple[Camera, ...]:
@@ -115,10 +117,7 @@ def _lengths(a: NDArray[np.float64], b: NDArray[np.float64], reach: float) -> ND
     distance `reach`, the displacement by rotation; world units."""
     cosines = np.abs(np.sum(a[..., 3:] * b[..., 3:], axis=-1))
     turns = 2 * np.arccos(np.clip(cosines, 0.0, 1.0))
-    found: NDArray[np.float64] = np.hypot(
-        np.linalg.norm(a[..., :3] - b[..., :3], axis=-1), reach * turns
-    )
-    return found
+    return np.asarray(np.hypot(np.linalg.norm(a[..., :3] - b[..., :3], axis=-1), reach * turns))
 
 
 def _spline(keys: NDArray[np.float64], spans: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -142,11 +142,11 @@ def _read_cameras(path: str) -> tuple[list[Camera], tuple[str, ...]]:
             wanted="orbit, capture, a transforms.json or a folder with a COLMAP model.",
             hint="Leave --path away to go around the scene once.",
         )
-    found = read_cameras(Path(path))
+    cameras = read_cameras(Path(path))
     notes: tuple[str, ...] = ()
-    if found.distorted:
+    if cameras.distorted:
         notes = (
-            f"Warning: in {path} are {counted(found.distorted, 'camera')} whose lens distorts; "
+            f"Warning: in {path} are {counted(cameras.distorted, 'camera')} whose lens distorts; "
             "the pictures are drawn as pinhole cameras see them.",
         )
-    return [view.camera for view in found.views], notes
+    return [view.camera for view in cameras.views], notes

@@ -118,10 +118,7 @@ def film_sink(path: Path, width: int, height: int, fps: float) -> Iterator[Put]:
 
 def eight_bits(image: NDArray[np.floating]) -> NDArray[np.uint8]:
     """[H, W, 3] uint8 of a rendering's colours; NaN becomes black."""
-    found: NDArray[np.uint8] = np.rint(np.clip(np.nan_to_num(image), 0.0, 1.0) * 255.0).astype(
-        np.uint8
-    )
-    return found
+    return np.asarray(np.rint(np.clip(np.nan_to_num(image), 0.0, 1.0) * 255.0).astype(np.uint8))
 
 
 def save_picture(path: Path, pixels: NDArray[np.uint8] | NDArray[np.float32]) -> None:

@@ -56,7 +56,7 @@ def with_photographs(
 ) -> tuple[list[PageCamera], dict[str, Item]]:
     """(the shots with the addresses of their photographs, the items by address)."""
     images = {view.name: view.image for view in views}
-    found, items = [], {}
+    shown, items = [], {}
     for number, shot in enumerate(shots):
         file = _inside(photos, images.get(shot.name, ""))
         if file is not None:
@@ -65,8 +65,8 @@ def with_photographs(
             kind = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
             items[f"/{address}"] = Item(file, kind)
             shot = replace(shot, photo=address)
-        found.append(shot)
-    return found, items
+        shown.append(shot)
+    return shown, items
 
 
 def _inside(folder: Path | None, name: str) -> Path | None:

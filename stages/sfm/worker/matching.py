@@ -106,8 +106,7 @@ class _IndexedFeatures:
                 progress.write("indexing features", i + 1, 2 * photographs)
             with replacing(path) as partial:
                 np.save(partial, build_vocabulary(np.concatenate(rows)))
-        found: NDArray[np.float32] = np.load(path)
-        return found
+        return np.asarray(np.load(path))
 
     def largest(self, position: int) -> tuple[FeatureIndex, NDArray[np.int64]]:
         """For pair selection: the largest features, and their words for retrieval."""
@@ -168,8 +167,7 @@ def _similarity(project: Project, features: _IndexedFeatures) -> NDArray[np.int3
     Stored for resumed runs."""
     photographs, stored = len(project.photographs), similarity_path(project.database)
     if stored.exists():
-        found: NDArray[np.int32] = np.load(stored)["similarity"]
-        return found
+        return np.asarray(np.load(stored)["similarity"])
     features.vocabulary()
     progress = ProgressWriter(project.database)
     similarity = np.zeros((photographs, photographs), np.int32)

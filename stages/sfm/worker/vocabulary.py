@@ -91,5 +91,4 @@ def word_pairs(
 
 def _similarity(points: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.float32]:
     """[N, W] larger for smaller Euclidean distances."""
-    similarity: NDArray[np.float32] = points @ words.T - 0.5 * np.sum(words**2, axis=1)
-    return similarity
+    return np.asarray(points @ words.T - 0.5 * np.sum(words**2, axis=1))
