@@ -97,7 +97,8 @@ def emit(event: str, **values: Any) -> None:
 
 
 def _refuse_urls(values: Mapping[str, Any]) -> None:
-    """Raise SplatError (url-not-local) for a path that is a URL, of which `Path` left one slash."""
+    """Raise SplatError (url-not-local) for a path that was typed as a URL; `Path` keeps one slash
+    of two."""
     for value in values.values():
         if isinstance(value, Path) and _URL.match(str(value)) and not value.exists():
             raise UsageError(

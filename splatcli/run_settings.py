@@ -75,7 +75,8 @@ def _view_parameter() -> Parameter:
 
 
 def _shown(setting: Setting) -> str | bool:
-    """The default for the help; "by preset" for a training setting in which presets differ."""
+    """The default for the help; "by preset" for a training setting whose value differs between
+    presets."""
     values = {getattr(preset, setting.name, setting.default) for preset in PRESETS.values()}
     by_preset = len(values) > 1 and setting in settings_of(type(PRESETS[DEFAULT_PRESET]))
     return "by preset" if by_preset else options.shown_default(setting)
@@ -104,8 +105,9 @@ def recorded(pipeline: Pipeline) -> dict[str, Any]:
 def combined(
     base: Mapping[str, Any], given: Mapping[str, Any], preset: str | None
 ) -> dict[str, Any]:
-    """`base` (settings by stage name) changed by a preset, then by the given options. The settings
-    of a single stage take all of them, those of several what `SHARED_OPTIONS` says.
+    """`base` (settings by stage name) changed by a preset, then by the given options. A single
+    stage takes all options that it has; of several stages each takes what `SHARED_OPTIONS` gives
+    it.
 
     Raises SplatError for a value or a combination that is not allowed, and for a backend that is
     not available here.

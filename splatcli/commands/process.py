@@ -87,8 +87,8 @@ def _run_folder_and_photos(photos: Path | None, out: Path | None) -> tuple[Path,
 
 
 def _run_stage(name: str, pipeline: Pipeline, given: Mapping[str, Any]) -> None:
-    """One stage, with the recorded settings and the given options. The stages after training take
-    little time: those that are missing in between run too."""
+    """One stage, with the recorded settings and the given options. Stages after training take
+    little time: where some are missing before this one, they run too."""
     from splatcli.distribution import distributed  # loads training, which `--help` does not need
 
     is_known = runfolder.is_run_folder(pipeline.run_folder)

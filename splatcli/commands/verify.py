@@ -135,8 +135,8 @@ def _of_file(file: Path, views: tuple[View, ...]) -> _Original:
 
 
 def _of_run(run: Pipeline) -> _Original:
-    """The splats that the run's export writes to a file, which may be fine-tuned for its format,
-    then those that a conversion would write."""
+    """The splats that the run's export writes to a file, which may be fine-tuned for its format;
+    then the splats that a conversion would write."""
     quantised: QuantisedSplats = run.load("quantise")
     cameras = cameras_for(drop_undrawable(quantised.splats)[0], run.load("sfm").views)
     prover_of = provers_of(quantised, cameras, results.backend_of_run(run))

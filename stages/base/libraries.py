@@ -15,8 +15,8 @@ _PYPROJECT = Path(__file__).resolve().parents[2] / "pyproject.toml"
 
 
 def needed() -> tuple[str, ...]:
-    """Names of the distributions that the project depends on, without its extras; of one that only
-    some versions of Python or systems get, where it is installed.
+    """Names of the distributions that the project needs, without its extras. One that only some
+    versions of Python or systems need is named where it is installed.
 
     They come from the installed metadata, or from `pyproject.toml` in a checkout that was never
     installed; () if there is neither.

@@ -179,8 +179,7 @@ def check_settings(settings: Any) -> None:
 
 
 def changed(settings: Any, typed: Mapping[str, Any]) -> Any:
-    """`settings` with those of the typed values that belong to it, checked. Raises as
-    `check_settings`."""
+    """`settings` with the typed values of its fields, checked. Raises as `check_settings`."""
     defaults = {field.name: field.default for field in fields(settings)}
     values = {name: value for name, value in typed.items() if name in defaults}
     values |= {name: defaults[name] for name, value in values.items() if value is UNSET}

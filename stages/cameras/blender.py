@@ -21,9 +21,9 @@ def locate(path: Path) -> Path | None:
 
 
 def read(folder: Path) -> CameraFile:
-    """The cameras of all files that exist; the role of a view is its split. Pictures that are
-    missing, as those of the validation split often are, get the size of the first training picture.
-    Raises SplatError "cameras-unreadable"."""
+    """The cameras of all files that exist; the role of a view is its split. A picture that is
+    missing, as validation pictures often are, gets the size of the first training picture. Raises
+    SplatError "cameras-unreadable"."""
     first = nerfstudio.read(_part(folder, "train"))
     size = first.views[0].camera.width, first.views[0].camera.height
     others = [name for name in _SPLITS[1:] if _part(folder, name).is_file()]

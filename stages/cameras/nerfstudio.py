@@ -129,7 +129,8 @@ def read_points(path: Path) -> FilePoints | None:
 
 
 def files(path: Path) -> list[Path]:
-    """The file, and that of its points. A damaged one is alone: reading it says what is wrong."""
+    """The file and the file of its points; a damaged file alone, because reading it says what is
+    wrong."""
     try:
         with reading(path, CAMERAS):
             points = _file_of_points(path, _document(path))

@@ -1,4 +1,4 @@
-"""Pinhole cameras and pictures from those of lenses with distortion.
+"""Undistorts cameras and pictures: from lenses with distortion to pinhole cameras.
 
 The pinhole camera has the focal lengths of the photograph's camera; its picture is the largest
 rectangle that the photograph covers, so it has no black borders (as COLMAP's image undistorter).

@@ -1,4 +1,4 @@
-"""Levels of detail of one scene, each with a quarter of the splats of the level before it."""
+"""Levels of detail of one scene: each has a quarter of the splats of the level before it."""
 
 from __future__ import annotations
 

@@ -121,7 +121,7 @@ def _left_product(q: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _sh_rotation(rotation: NDArray[np.float64], sh_degree: int) -> NDArray[np.float64]:
-    """[K, K] the matrix that takes SH coefficients to those of the rotated function.
+    """[K, K] the matrix that rotates SH coefficients.
 
     The rotated function at a direction d is the original at rotation.T @ d. Coefficients of one
     degree only mix among themselves, so the values at more directions than a degree has

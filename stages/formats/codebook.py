@@ -112,7 +112,8 @@ def vector_palette(
 
 
 def _distinct(vectors: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """(first row of each distinct vector, which one each row is), compared by a 64-bit hash."""
+    """(the first row of each distinct vector, the number of its distinct vector for each row), by a
+    64-bit hash."""
     factors = np.random.default_rng(1).integers(1, 1 << 63, vectors.shape[1], np.uint64) | 1
     sums = np.empty(len(vectors), np.uint64)
     for rows in row_slices(len(vectors)):

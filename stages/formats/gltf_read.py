@@ -1,4 +1,4 @@
-"""Reading KHR_gaussian_splatting, from our files and those of other programs.
+"""Reads KHR_gaussian_splatting, written by this project or by other programs.
 
 Every number of the JSON is checked before use, because a file may come from anywhere. Buffers are
 the binary chunk, data: URIs, or files in its folder or below; nothing is fetched.

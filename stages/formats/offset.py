@@ -1,4 +1,5 @@
-"""Origin and place of a scene, in a file of JSON beside those that have no field for them."""
+"""Origin and place of a scene, in a JSON file beside a splat file whose format has no field for
+them."""
 
 from __future__ import annotations
 

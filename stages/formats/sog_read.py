@@ -1,4 +1,4 @@
-"""Reading SOG version 2, from our files and those of other programs.
+"""Reads SOG version 2, written by this project or by other programs.
 
 Nothing is unpacked to disk. Members are found by their names in meta.json, and sizes are compared
 with the number of splats before memory is allocated.

@@ -1,4 +1,4 @@
-"""Reading SPZ versions 2, 3 and 4, from our files and those of other programs.
+"""Reads SPZ versions 2, 3 and 4, written by this project or by other programs.
 
 The arrays are those of `spz`. Versions 2 and 3: gzip around a header of 16 bytes and the arrays;
 rotations of version 2 are x, y, z as uint8. Version 4: an uncompressed header of 32 bytes, records

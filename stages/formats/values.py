@@ -70,7 +70,7 @@ def drop_undrawable(splats: Splats) -> tuple[Splats, int]:
 
 
 def nothing_drawable(path: Path, dropped: int) -> SplatError:
-    """The error of a file of splats, none of which can be drawn."""
+    """The error for a file in which no splat can be drawn."""
     return SplatError(
         "nothing-drawable",
         given=f"None of the {dropped:,} splats of {path} can be drawn.",

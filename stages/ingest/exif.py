@@ -94,7 +94,7 @@ class Exif:
         return ", ".join(part for part in (name or "unknown", focal, equivalent, size) if part)
 
     def _cropped(self, stored: tuple[int, int]) -> bool:
-        """Whether the proportions are no longer those that the camera wrote."""
+        """Whether the picture no longer has the proportions that the camera wrote."""
         if self.pixels is None:
             return False
         was = max(self.pixels) / min(self.pixels)

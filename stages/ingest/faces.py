@@ -87,8 +87,8 @@ def face_photo(photo: Photo, name: str, width: int, height: int, focal_px: float
 
 
 def face_rotation(yaw_deg: float, pitch_deg: float) -> NDArray[np.float64]:
-    """[3, 3] from the panorama's axes to those of the face in this direction: first the yaw, then
-    the pitch, so that the face's x axis stays level."""
+    """[3, 3] from the panorama's axes to the axes of the face in this direction: first the yaw,
+    then the pitch, so that the face's x axis stays level."""
     yaw, pitch = np.radians([yaw_deg, pitch_deg])
     x = np.array([np.cos(yaw), 0.0, -np.sin(yaw)])
     z = np.array([np.sin(yaw) * np.cos(pitch), -np.sin(pitch), np.cos(yaw) * np.cos(pitch)])

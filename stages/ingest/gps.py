@@ -1,4 +1,4 @@
-"""Where a photograph was taken: the GPS tags of Exif, and those that DJI writes into XMP.
+"""Where a photograph was taken: by the GPS tags of Exif, and by the XMP tags of DJI.
 
 A DJI aircraft that corrects its positions by a base station (RTK) writes them into XMP with more
 digits, with the kind of the fix and its standard deviations. `RtkFlag` is 50 for a fixed solution,

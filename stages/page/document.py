@@ -71,7 +71,8 @@ def _in_utf8(name: str) -> str:
 
 
 def _bounds(splats: Splats) -> dict[str, list[float]]:
-    """The range in which a box is selected: the central splats, because a few lie far away."""
+    """The box that a selection starts from: it holds the central splats, because a few lie far
+    away."""
     if not len(splats):
         return {"min": [0.0] * 3, "max": [0.0] * 3}
     low, high = np.percentile(splats.means, _MIDDLE_PERCENT, axis=0)

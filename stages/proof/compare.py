@@ -113,8 +113,8 @@ def differences(splats: Splats, content: FileContent, *names: str) -> Difference
 
 
 def _orders(truth: Splats, file: Splats, names: tuple[str, ...]) -> Iterator[Rows]:
-    """The orders in which the formats may have written either side; an iterator, because the first
-    often fits."""
+    """The row orders in which a format may have written the original or the file. An iterator,
+    because the first often fits."""
     for name in names:
         if order := CODECS[name].order:
             yield order(truth)
@@ -144,7 +144,7 @@ def _errors(a: Splats, b: Splats) -> dict[str, NDArray[np.floating]]:
 
 
 def _changes(errors: dict[str, NDArray[np.floating]], splats: Splats) -> dict[str, Change]:
-    """Of the errors of `splats`, see `_errors`, those that are worth a warning."""
+    """The errors of `splats` that are worth a warning; see `_errors`."""
     if not len(splats):
         return {}
     moved = errors["position"] > errors["own_size"]

@@ -143,8 +143,8 @@ class Prover:
         return Prover.of(splats, self.cameras, self.backend, self.source_format)
 
     def plain_drawing_db(self) -> float:
-        """Mean PSNR between the pictures and those of a viewer that does not compensate opacities,
-        of splats that are to be drawn with compensation."""
+        """Mean PSNR between the pictures, drawn with opacity compensation, and what a viewer
+        without it draws."""
         plain = self.with_original(self.splats.with_antialias(False))
         pairs = zip(plain.pictures, self.pictures, strict=True)
         return float(np.mean([capped_psnr_db(a, np.clip(b, 0.0, 1.0)) for a, b in pairs]))

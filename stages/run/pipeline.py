@@ -82,7 +82,7 @@ class Pipeline:
         return recorded.photographs if recorded else None
 
     def with_exported(self, formats: Collection[str]) -> tuple[str, ...]:
-        """The given formats after those that the run has exported, which stay."""
+        """The formats that the run has exported, which stay, and then the given ones."""
         exported = self.manifest("export")
         earlier = exported.settings.get("formats", ()) if exported else ()
         return tuple(dict.fromkeys((*earlier, *formats)))
@@ -189,8 +189,8 @@ class Pipeline:
             listener.ended()
 
     def _forget(self, before: RunFile, changed: RunFile, refusing: Stage) -> None:
-        """Record the settings of a stage that refused, and of later ones, as they were `before`, if
-        the command `changed` those of the stage."""
+        """If the command changed the settings of a stage that refused, record the settings of this
+        stage and of later ones as they were `before`."""
         if before.settings_of([refusing]) != changed.settings_of([refusing]):
             later = self.layout.stages[self.layout.number(refusing) - 1 :]
             names = {stage.name for stage in later}
@@ -204,9 +204,8 @@ class Pipeline:
         listener: Listener,
         forget: Callable[[Stage], None],
     ) -> list[Manifest]:
-        """forget: records the settings of a stage, and of later ones, as they were before, if the
-        command changed those of the stage: otherwise a command without the refused options, of
-        which one is named, would fail as well."""
+        """forget: is called with a stage that refused its options or inputs, see `_forget`.
+        Otherwise a later command without the refused options would fail as well."""
         manifests, began = [], time.monotonic() if until is None else None
         for stage in self.layout.up_to(until):
             try:

@@ -16,8 +16,8 @@ LEAST_S = 1.0  # seconds
 
 
 def within_limit(stage: str, settings: Any, elapsed: float) -> Any:
-    """The settings of a stage that begins `elapsed` seconds after the command: `seconds`, if set,
-    is the limit of the command, and becomes that of the stage."""
+    """The settings of a stage that begins `elapsed` seconds after the command. `seconds`, if set,
+    is the limit of the command; the stage gets its share of what is left."""
     seconds = getattr(settings, "seconds", 0.0)
     if not seconds:
         return settings

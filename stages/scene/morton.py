@@ -37,7 +37,7 @@ def morton_order_of(means: NDArray[np.floating]) -> NDArray[np.intp]:
 
 
 def _ranks(values: NDArray[np.floating]) -> NDArray[np.uint64]:
-    """[N] rank of each value among the distinct ones, scaled to the bits of one axis."""
+    """[N] rank of each value among the distinct values, scaled to the bits of one axis."""
     distinct, place = np.unique(values, return_inverse=True)
     last = max(1, len(distinct) - 1)
     return np.asarray(

@@ -19,7 +19,8 @@ _FAR_SPREADS, _FAR_UNITS = 1000.0, 1000.0
 def recentred(
     means: NDArray[np.float64], origin: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """(means [N, 3] float32, origin [3]) whose sum is that of the arguments.
+    """(means [N, 3] float32, origin [3]): the origin that was taken out of the means is added to
+    the given one.
 
     Means that are far from zero for their spread are moved near zero by whole units; others are
     unchanged, and so are means that float32 holds as they are, because nothing is gained. A value

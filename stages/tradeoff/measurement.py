@@ -1,4 +1,4 @@
-"""Measures the trade-offs of one run: from its log, and by what is cheap to do again."""
+"""Measures the trade-offs of a run: time from its log, bytes by writing, splats by pruning."""
 
 from __future__ import annotations
 

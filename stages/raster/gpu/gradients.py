@@ -104,7 +104,7 @@ def scale_gradient(out, k, mask, by_size, by_opacity, ratio):
 
 @inner
 def rotation_gradient(out, mask, q0, q1, q2, q3, norm, r00, r10, r20, r01, r11, r21, r02, r12, r22):
-    """Gradient of the quaternion from that of its matrix."""
+    """Gradient of a quaternion from the gradient of its rotation matrix."""
     n0 = 2.0 * (q1 * (r21 - r12) + q2 * (r02 - r20) + q3 * (r10 - r01))
     n1 = 2.0 * (q2 * (r01 + r10) + q3 * (r02 + r20) + q0 * (r21 - r12)) - 4.0 * q1 * (r11 + r22)
     n2 = 2.0 * (q1 * (r01 + r10) + q3 * (r12 + r21) + q0 * (r02 - r20)) - 4.0 * q2 * (r00 + r22)
