@@ -54,6 +54,7 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     if trained.contradicted and not settings.allow_partial:
         raise _contradicted()
     reconstruction: Reconstruction = inputs["sfm"].with_cameras(trained.cameras)
+    reconstruction = reconstruction.with_masks(trained.masks)
     splats, backend = trained.splats, settings.backend
     _check_one_splat(settings, splats, reconstruction)
     training, held_out = (

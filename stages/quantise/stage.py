@@ -74,7 +74,7 @@ def run(
     """
     splats: Splats = inputs["prune"]
     trained: TrainedSplats = inputs["train"]
-    reconstruction = inputs["sfm"].with_cameras(trained.cameras)
+    reconstruction = inputs["sfm"].with_cameras(trained.cameras).with_masks(trained.masks)
     decider, evaluator = _measures(reconstruction, splats.draw_settings, settings, report)
     earlier = _Earlier.of(report)
     kept, by_degree, threshold = (

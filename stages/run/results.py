@@ -11,7 +11,7 @@ from stages.formats import read
 from stages.raster.backends import AUTO, runs_here
 from stages.run import runfolder
 from stages.run.pipeline import Pipeline
-from stages.scene import Reconstruction, Splats, View, draw_settings_of
+from stages.scene import Reconstruction, Splats, TrainedSplats, View, draw_settings_of
 
 _STAGES_WITH_SPLATS = ("seed", "train", "prune", "quantise")
 
@@ -77,7 +77,8 @@ def reconstruction_of(pipeline: Pipeline) -> Reconstruction:
     reconstruction: Reconstruction = pipeline.load("sfm")
     if pipeline.manifest("train") is None or "train" in out_of_date(pipeline):
         return reconstruction
-    return reconstruction.with_cameras(pipeline.load("train").cameras)
+    trained: TrainedSplats = pipeline.load("train")
+    return reconstruction.with_cameras(trained.cameras).with_masks(trained.masks)
 
 
 def final_splats(pipeline: Pipeline) -> Splats:

@@ -186,6 +186,16 @@ class Reconstruction:
             return self
         return replace(self, views=tuple(refined.view(view) for view in self.views))
 
+    def with_masks(self, masks: Mapping[str, Path]) -> Reconstruction:
+        """The same, where views by name ignore what lies outside other masks."""
+        views = (
+            replace(view, mask=str(masks[view.name].absolute()), outside=IGNORE)
+            if view.name in masks
+            else view
+            for view in self.views
+        )
+        return replace(self, views=tuple(views))
+
 
 def split_held_out(views: tuple[View, ...]) -> tuple[tuple[View, ...], tuple[View, ...]]:
     """(training views, held-out test views). Held out, for evaluation only, is the first of every

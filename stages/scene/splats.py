@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,12 +127,14 @@ class TrainedSplats:
         dropout: whether some were dropped from each of the last steps (`train.dropout`).
         cameras: where training has refined them; None where it has not.
         contradicted: whether they are wrong because photographs contradict each other.
+        masks: of training views that show what moved, which training ignored; by name.
     """
 
     splats: Splats
     dropout: bool = False
     cameras: RefinedCameras | None = None
     contradicted: bool = False
+    masks: Mapping[str, Path] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,5 @@
-"""The contact sheet of held-out views beside their renders (`held_out.png`), and the plot of the
-evaluations during training (`training.png`)."""
+"""The contact sheets of held-out views beside their renders (`held_out.png`) and of what moved
+(`transients.png`), and the plot of the evaluations during training (`training.png`)."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from stages.base.plots import BLUE, ORANGE, new_plot, write_plot
 from stages.evaluate.evaluation import SIZES
 from stages.scene.pictures import scaled_image
 from stages.train.history import HistoryEntry
+from stages.train.views import Level
 
 SHEET_COLUMN = 480  # pixels, at most
 ERROR_GAIN = 4.0
@@ -35,15 +36,38 @@ def contact_sheet(
         )
         legend.append(f"{number}  {name}  {figures}\n")
         error = np.clip(np.abs(image - truth) * ERROR_GAIN, 0, 1)
-        tiles = [_fitted(tile) for tile in (truth, image, error)]
-        strip = np.hstack(tiles)
-        title = np.full((26, strip.shape[1], 3), 24, np.uint8)
-        shown = f"{number}  {name if name.isascii() else f'(see {path.stem}.txt)'}"
-        text = f"{shown}   photograph | render {decibels[0]:.2f} dB | error x{ERROR_GAIN:.0f}"
-        cv2.putText(title, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (220,) * 3, 1, cv2.LINE_AA)
-        strips.append(np.vstack([title, strip]))
-    if not strips:
-        return
+        text = f"photograph | render {decibels[0]:.2f} dB | error x{ERROR_GAIN:.0f}"
+        strips.append(_strip(path, number, name, text, (truth, image, error)))
+    if strips:
+        _save_sheet(path, strips, legend)
+
+
+def transients_sheet(path: Path, views: Sequence[tuple[str, Level]]) -> None:
+    """A PNG with a numbered row for each photograph by name: as it was taken, and with grey where
+    training ignored it; and a .txt as of `contact_sheet`."""
+    strips, legend = [], []
+    for number, (name, level) in enumerate(views, 1):
+        photograph = level.pixels.transpose(1, 2, 0) * np.float32(1 / 255)
+        ignored = np.zeros_like(photograph) if level.mask is None else level.mask[..., None] == 0
+        used = np.where(ignored, np.float32(0.5), photograph)
+        strips.append(_strip(path, number, name, "photograph | used", (photograph, used)))
+        legend.append(f"{number}  {name}\n")
+    _save_sheet(path, strips, legend)
+
+
+def _strip(
+    path: Path, number: int, name: str, text: str, tiles: Sequence[NDArray[np.float32]]
+) -> NDArray[np.uint8]:
+    """Pictures side by side, below a title."""
+    strip = np.hstack([_fitted(tile) for tile in tiles])
+    title = np.full((26, strip.shape[1], 3), 24, np.uint8)
+    shown = f"{number}  {name if name.isascii() else f'(see {path.stem}.txt)'}   {text}"
+    cv2.putText(title, shown, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (220,) * 3, 1, cv2.LINE_AA)
+    return np.vstack([title, strip])
+
+
+def _save_sheet(path: Path, strips: Sequence[NDArray[np.uint8]], legend: Sequence[str]) -> None:
+    """Write the strips, one below another, as a PNG, and the legend beside it."""
     width = max(strip.shape[1] for strip in strips)
     padded = [np.pad(s, ((0, 0), (0, width - s.shape[1]), (0, 0))) for s in strips]
     with replacing(path) as temporary:

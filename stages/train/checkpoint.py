@@ -13,12 +13,13 @@ import json
 import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.lib import format as npy
+from numpy.typing import NDArray
 
 from stages.base.atomic import rename, sync_folder
 from stages.raster.backends import backend_of
@@ -27,7 +28,7 @@ from stages.train.history import HistoryEntry
 from stages.train.optimiser import Model
 
 FILE_NAME = "checkpoint.bin"
-MAGIC = b"SPLATC14"
+MAGIC = b"SPLATC15"
 _PREVIOUS = "checkpoint-previous.bin"
 _TEMPORARY = FILE_NAME + ".tmp"
 _CHUNK_BYTES = 1 << 20
@@ -66,6 +67,7 @@ class TrainingState:
         times: of each entry of the history, and, last, now.
         provenance: one entry for each change of backend or device.
         refinement: of cameras, see `camera_refinement`; None where they stay as they are.
+        transient: for each training view [h, w] the parts that show what moved.
     """
 
     step: int
@@ -74,13 +76,14 @@ class TrainingState:
     times: list[Elapsed]
     provenance: list[Provenance]
     refinement: dict[str, Any] | None = None
+    transient: list[NDArray[np.bool_]] = field(default_factory=list)
 
 
 def save_checkpoint(folder: Path, model: Model, state: TrainingState) -> None:
     """Write the checkpoint, once it is complete, under its name; the one before it is kept."""
     path, temporary = folder / FILE_NAME, folder / _TEMPORARY
     with temporary.open("w+b") as file:
-        header = json.dumps(dataclasses.asdict(state)).encode()
+        header = json.dumps(dataclasses.asdict(state), default=_as_rows).encode()
         file.write(MAGIC + len(header).to_bytes(8, "little") + header)
         for array in vars(model).values():
             npy.write_array(file, array, allow_pickle=False)
@@ -92,6 +95,10 @@ def save_checkpoint(folder: Path, model: Model, state: TrainingState) -> None:
         rename(path, folder / _PREVIOUS)
     rename(temporary, path)
     sync_folder(folder)
+
+
+def _as_rows(array: NDArray[np.bool_]) -> object:
+    return array.astype(np.uint8).tolist()
 
 
 def load_checkpoint(
@@ -139,6 +146,7 @@ def _read(file: BinaryIO) -> tuple[Model, TrainingState]:
     header["history"] = [HistoryEntry(**entry) for entry in header["history"]]
     header["times"] = [Elapsed(**entry) for entry in header["times"]]
     header["provenance"] = [Provenance(**entry) for entry in header["provenance"]]
+    header["transient"] = [np.array(rows, np.bool_) for rows in header["transient"]]
     state = TrainingState(**header | {"plan": tuple(header["plan"])})
     return Model(*(np.ascontiguousarray(a) for a in arrays)), state
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from stages.base.errors import Interrupted
 from stages.evaluate.evaluation import EvaluationView, evaluate, evaluation_subset
 from stages.raster.backends import backend_of, rasteriser_of
+from stages.raster.draw import rendering_of
 from stages.scene import Camera, Splats
 from stages.train.colour_refit import ColourRefit, needs_colour_refit
 from stages.train.density import (
@@ -25,10 +26,11 @@ from stages.train.density import (
 )
 from stages.train.free_space import FreeSpace, known_free_space
 from stages.train.optimiser import empty_model
+from stages.train.schedule import HALF_SIZE_END, QUARTER
 from stages.train.sparsification import Sparsification
 from stages.train.time_limit import TimeLimit
 from stages.train.trainer import Trainer
-from stages.train.views import Level, TrainingView
+from stages.train.transients import Comparison, transient_parts
 
 CHECKPOINT_SECONDS = 30.0
 EVALUATIONS = 10  # evenly spaced over the run
@@ -53,6 +55,7 @@ def step_hooks(trainer: Trainer, start: Splats) -> list[StepHook]:
     # of the cameras before their refinement, which a resumed run has, too
     free_space = known_free_space(start.means, [v.levels[-1].camera for v in task.views])
     return [
+        Transients(),
         FloaterRemoval(free_space),
         Densification(density),
         Sparsification(start, density),
@@ -63,6 +66,28 @@ def step_hooks(trainer: Trainer, start: Splats) -> list[StepHook]:
         Progress(),
         LivePreview(),
     ]
+
+
+@dataclass(frozen=True)
+class Transients:
+    """Once, before the run draws at full size, decides which parts of photographs show what moved,
+    see `transients`; training ignores them from then on."""
+
+    def after_step(self, trainer: Trainer, step: int) -> None:
+        if trainer.transient or trainer.schedule.share(step) < HALF_SIZE_END:
+            return
+        views = trainer.task.views
+        settings = trainer.raster_settings(trainer.schedule.active_sh_degree(step))
+        rasteriser = rasteriser_of(backend_of(trainer.task.backend).name)
+        arrays = rasteriser.loaded(trainer.model.on_host().drawn(trainer.task.smooth))
+        compared = []
+        for view, camera in zip(views, trainer.cameras, strict=True):
+            level = view.levels[QUARTER]
+            size = level.camera.width, level.camera.height
+            level = replace(level, camera=camera.resized(*size))
+            drawn = rendering_of(rasteriser.forward(arrays, level.camera, settings, depths=True))
+            compared.append(Comparison.of(level, drawn, settings.background))
+        trainer.transient = transient_parts(compared)
 
 
 @dataclass(frozen=True)
@@ -107,15 +132,10 @@ class FinalColourRefit:
         refit = ColourRefit(
             rasteriser_of(backend_of(trainer.task.backend).name),
             trainer.raster_settings(trainer.schedule.sh_degree),
-            lambda: map(_level_with_camera, trainer.task.views, trainer.cameras),
+            lambda: map(trainer.level, range(len(trainer.task.views))),
             trainer.task.smooth,
         )
         trainer.stepper.load(refit.of(model))
-
-
-def _level_with_camera(view: TrainingView, camera: Camera) -> Level:
-    """The view at full size, with its refined camera."""
-    return replace(view.levels[-1], camera=camera)
 
 
 @dataclass(frozen=True)

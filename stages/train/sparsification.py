@@ -20,12 +20,12 @@ from stages.evaluate.contribution import MAX_MEASURED_VIEWS, measure_contributio
 from stages.evaluate.evaluation import EvaluationView
 from stages.evaluate.selection import RemovalLimits, select_removal
 from stages.raster.smoothing import smoothed
-from stages.scene import Camera, Splats, evenly_spaced
+from stages.scene import Splats, evenly_spaced
 from stages.train.conversion import splats_of, valid_rows
 from stages.train.density import DensityRule
 from stages.train.optimiser import Model, empty_model
 from stages.train.trainer import Trainer
-from stages.train.views import TrainingView
+from stages.train.views import Level
 
 SHARES = (0.52, 0.63, 0.74, 0.85)  # of the run, after which a round happens
 LARGEST_ROUND = 0.2  # of the splats
@@ -62,7 +62,7 @@ class Sparsification:
             splats = smoothed(splats, model.smoothing)
         rows = evenly_spaced(range(len(task.views)), MAX_MEASURED_VIEWS)
         cameras, background = list(trainer.cameras), task.draw_settings.background
-        views = (_evaluation_view(task.views[row], cameras[row], background) for row in rows)
+        views = (_evaluation_view(task.views[r].name, trainer.level(r), background) for r in rows)
         contributions = measure_contributions(splats, views, task.backend, truncation=False)
         change = contributions.sse * (10 ** (LOSS_DB / len(SHARES) / 10) - 1)
         most = int(LARGEST_ROUND * len(splats))
@@ -74,8 +74,7 @@ class Sparsification:
         return model.take(~removal.removed | ~self.density.inside(model))
 
 
-def _evaluation_view(view: TrainingView, camera: Camera, background: float) -> EvaluationView:
-    level = view.levels[-1]
+def _evaluation_view(name: str, level: Level, background: float) -> EvaluationView:
     pixels = np.ascontiguousarray(level.pixels.transpose(1, 2, 0))
-    photograph = EvaluationView(view.name, camera, pixels, level.mask, level.outside)
+    photograph = EvaluationView(name, level.camera, pixels, level.mask, level.outside)
     return photograph.in_median_light(level.light).over(background)

@@ -7,6 +7,7 @@ removed on the way (`train.hooks`). Held-out views are evaluated and decide noth
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -19,12 +20,14 @@ from stages.base.atomic import replacing
 from stages.base.bad_files import reading, stage_output
 from stages.base.errors import QualityError, ResourceError, SplatError
 from stages.base.stage import Report
+from stages.base.text import counted
 from stages.evaluate.verdict import WRONG
 from stages.raster.backends import report_backend, unavailable_backends
 from stages.raster.definition import MemoryFull
 from stages.raster.smoothing import smoothed
 from stages.scene import Reconstruction, RefinedCameras, Splats, TrainedSplats
 from stages.scene.storage import load_splats, save_splats
+from stages.train import transients
 from stages.train.build import make_trainer
 from stages.train.cap import (
     DEVICE_MEMORY,
@@ -34,6 +37,7 @@ from stages.train.cap import (
     memory_mib,
     remove_cap,
 )
+from stages.train.charts import transients_sheet
 from stages.train.checkpoint import remove_checkpoint
 from stages.train.conversion import splats_of
 from stages.train.loop import train
@@ -74,11 +78,13 @@ def run(
     if trainer.refinement is not None:
         held_out, refined = trainer.registered_held_out(), trainer.refinement.result
         reconstruction = reconstruction.with_cameras(refined)
+    masks = _save_masks(trainer, folder, report)
+    reconstruction = reconstruction.with_masks(masks)
     write_quality(trainer.render, held_out, task.draw_settings, reconstruction, folder, report)
     write_history(trainer.history, folder, report)
     found = report_verdict(splats, held_out, reconstruction, task.backend, report)
     contradicted = found.grade == WRONG and reconstruction.contradicted
-    trained = TrainedSplats(splats, task.dropout, refined, contradicted)
+    trained = TrainedSplats(splats, task.dropout, refined, contradicted, masks)
     save(folder, trained)
     remove_checkpoint(folder)
     remove_cap(folder)
@@ -94,6 +100,27 @@ def run(
     _report_cap(trainer.cap, trainer.history.most_splats, report)
     report.metric("train_seconds", round(time.monotonic() - started, 1))
     return trained
+
+
+def _save_masks(trainer: Trainer, folder: Path, report: Report) -> dict[str, Path]:
+    """Write what the photographs show of what moved, and report it; the masks by photograph."""
+    shares = [float(parts.mean()) for parts in trainer.transient]
+    report.metric("transient_share", round(float(np.mean(shares or [0.0])), 4))
+    shutil.rmtree(folder / transients.FOLDER, ignore_errors=True)
+    if not any(shares):
+        return {}
+    rows = range(len(shares))
+    names = [view.name for view in trainer.task.views]
+    masks = transients.save_masks(folder, names, map(trainer.level, rows), trainer.transient)
+    most = sorted(rows, key=lambda row: -shares[row])[: transients.SHOWN]
+    photographs = [(names[row], trainer.level(row)) for row in most if names[row] in masks]
+    transients_sheet(folder / "transients.png", photographs)
+    report.warn(
+        "train-transients",
+        f"Something moved in {counted(len(masks), 'photograph')}: training ignored the parts that "
+        "other photographs do not confirm, see transients.png.",
+    )
+    return masks
 
 
 def _report_task(task: TrainingTask, settings: TrainSettings, report: Report) -> None:
@@ -171,6 +198,9 @@ def save(folder: Path, trained: TrainedSplats) -> None:
     """What `load` reads. Raises SplatError."""
     save_splats(folder, trained.splats)
     facts: dict[str, Any] = {"dropout": trained.dropout, "contradicted": trained.contradicted}
+    facts["masks"] = {
+        name: path.relative_to(folder).as_posix() for name, path in trained.masks.items()
+    }
     if trained.cameras is not None:
         poses = {name: pose.tolist() for name, pose in trained.cameras.poses.items()}
         facts["cameras"] = {"poses": poses, "focal_factor": trained.cameras.focal_factor}
@@ -187,4 +217,5 @@ def load(folder: Path) -> TrainedSplats:
             poses = {name: np.array(pose, np.float64) for name, pose in found["poses"].items()}
             cameras = RefinedCameras(poses, float(found["focal_factor"]))
         contradicted = bool(facts.get("contradicted"))
-        return TrainedSplats(splats, bool(facts["dropout"]), cameras, contradicted)
+        masks = {name: folder / path for name, path in facts.get("masks", {}).items()}
+        return TrainedSplats(splats, bool(facts["dropout"]), cameras, contradicted, masks)

@@ -34,9 +34,10 @@ from stages.train.conversion import initial_model
 from stages.train.dropout import Dropout, uses_dropout
 from stages.train.history import History
 from stages.train.optimiser import LearningRates, Model
-from stages.train.schedule import Schedule
+from stages.train.schedule import FULL, Schedule
 from stages.train.steps.memory_limited import MemoryLimitedStep
 from stages.train.steps.step import StepInput, TrainingStep, step_of
+from stages.train.transients import without
 from stages.train.views import Level, TrainingView
 
 REGISTRATION_STEPS = 60  # for each held-out view
@@ -96,6 +97,8 @@ class Trainer:
         schedule: what happens at which step; a time limit replaces it.
         cap: the largest number of splats; a full device lowers it.
         refinement: of the cameras of the training views; None leaves them as they are.
+        transient: for each training view [h, w] the parts that show what moved; empty before
+            this is known.
     """
 
     task: TrainingTask
@@ -107,6 +110,7 @@ class Trainer:
     loss: float = field(init=False, default=float("nan"))  # of the last step
     history: History = field(init=False, default_factory=History)
     provenance: list[Provenance] = field(init=False, default_factory=list)
+    transient: list[NDArray[np.bool_]] = field(init=False, default_factory=list)
     _random_background: bool = field(init=False)
 
     def __post_init__(self) -> None:
@@ -125,7 +129,7 @@ class Trainer:
             self._place(model)
         else:
             model, state = most_opaque(saved[0], self.cap.splats), saved[1]
-            step, self.provenance = state.step, state.provenance
+            step, self.provenance, self.transient = state.step, state.provenance, state.transient
             *times, elapsed = state.times
             self.history, self.clock = History(state.history, times), Clock(elapsed)
             self.schedule = self.schedule.as_planned(*state.plan)
@@ -146,9 +150,8 @@ class Trainer:
         if smooth and step % SMOOTHING_INTERVAL == 0:
             self.replace_model(self.model)
         row, refine = self._row(step), None
-        level = self.task.views[row].levels[schedule.level(step)]
+        level = self.level(row, schedule.level(step))
         if self.refinement is not None:
-            level = replace(level, camera=self.refinement.camera(row, level.camera))
             refine = partial(self.refinement.update, row, schedule.share(step))
         if step + 1 < schedule.steps:
             self.task.views[self._row(step + 1)].prefetch(schedule.level(step + 1))
@@ -188,6 +191,13 @@ class Trainer:
     def _row(self, step: int) -> int:
         """Which training view `step` uses."""
         return self.schedule.view(step, len(self.task.views))
+
+    def level(self, row: int, number: int = FULL) -> Level:
+        """A level of a training view with its refined camera, and without what moved."""
+        level = self.task.views[row].levels[number]
+        if self.refinement is not None:
+            level = replace(level, camera=self.refinement.camera(row, level.camera))
+        return without(level, self.transient[row]) if self.transient else level
 
     @property
     def model(self) -> Model:
@@ -245,6 +255,7 @@ class Trainer:
             times=[*self.history.times, self.clock.elapsed()],
             provenance=self.provenance,
             refinement=None if self.refinement is None else self.refinement.state(),
+            transient=self.transient,
         )
         save_checkpoint(self.task.folder, self.model.on_host(), state)
 

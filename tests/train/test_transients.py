@@ -1,0 +1,145 @@
+"""What moved between photographs is ignored; what the model cannot show, or the light, is not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stages.base.stage import Report
+from stages.raster.draw import render
+from stages.scene import IGNORE, TRANSPARENT, DrawSettings, look_at
+from stages.train.checkpoint import load_checkpoint
+from stages.train.conversion import model_of
+from stages.train.hooks import Transients
+from stages.train.schedule import HALF_SIZE_END, Schedule
+from stages.train.transients import PARTS, without
+from stages.train.views import Level
+from tests.scenes import camera, splats
+from tests.train.pictures import trainer_of, view_of
+
+STEPS = 100
+WIDTH, HEIGHT = 4 * 2 * PARTS, 3 * 2 * PARTS  # parts of two pixels at a quarter of the size
+FIGURE = (slice(48, 104), slice(80, 128))  # rows and columns that it covers
+SKIN = (0.9, 0.3, 0.2)
+
+
+def wall():
+    """A wall of splats of several greens, 3 units in front of the cameras."""
+    at = np.stack(np.meshgrid(np.arange(-3, 3, 0.12), np.arange(-2.5, 2.5, 0.12), [3.0]), -1)
+    means = at.reshape(-1, 3)
+    tints = np.random.default_rng(0).uniform((0.1, 0.4, 0.1), (0.3, 0.8, 0.3), (len(means), 3))
+    return splats(means, 0.1, 0.95, tints)
+
+
+def photographs(change, count=7):
+    """[(picture [H, W, 3], camera)] of the wall; `change(number, picture)` edits each."""
+    taken = []
+    for number in range(count):
+        pose = look_at(np.array([0.2 * number - 0.6, 0.0, 0.0]), np.array([0.0, 0.0, 3.0]))
+        where = camera(WIDTH, HEIGHT, 180.0, matrix=pose)
+        picture = np.clip(render(wall(), where).image, 0, 1)
+        change(number, picture)
+        taken.append((picture, where))
+    return taken
+
+
+def trainer(folder, taken, outside="", mask=None, steps=STEPS):
+    views = [view_of(f"{i}", picture, where) for i, (picture, where) in enumerate(taken)]
+    schedule = Schedule(steps=steps, extent=3.0, sh_degree=0, n_start=len(wall()), seed=0)
+    made = trainer_of(
+        *(schedule, views, [], DrawSettings(near=0.1), len(wall()), folder, Report()), backend="cpu"
+    )
+    made.stepper.load(model_of(wall()))
+    return made
+
+
+def transient(made, step=round(HALF_SIZE_END * STEPS)):
+    """[views] parts of each view after this step."""
+    Transients().after_step(made, step)
+    return made.transient
+
+
+def with_figure(number, picture):
+    if number in (1, 4):
+        picture[FIGURE] = SKIN
+
+
+def test_a_figure_in_two_photographs_is_ignored_there_and_nowhere_else(tmp_path):
+    taken = photographs(with_figure)
+    made = trainer(tmp_path, taken)
+    found = transient(made)
+    for number, parts in enumerate(found):
+        level = without(made.task.views[number].levels[-1], parts)
+        if number not in (1, 4):
+            assert level.mask is None
+            continue
+        figure = np.zeros((HEIGHT, WIDTH), bool)
+        figure[FIGURE] = True
+        assert level.outside == IGNORE
+        assert (level.mask[figure] == 0).all()
+        assert (level.mask[~figure] == 0).mean() < 0.1
+
+
+def darker(number, picture):
+    if number == 2:
+        picture[FIGURE] *= 0.6  # a shadow
+
+
+def everywhere(_, picture):
+    picture[FIGURE] = SKIN  # of the same place of the picture: the model is wrong there in all
+
+
+def few(number, picture):
+    if number == 1:
+        picture[48:56, 80:88] = SKIN  # a hundredth of one picture
+
+
+@pytest.mark.parametrize("change", [darker, everywhere, few, lambda *_: None])
+def test_shadows_and_what_no_photograph_confirms_are_not_ignored(change, tmp_path):
+    found = transient(trainer(tmp_path, photographs(change)))
+    assert not any(parts.any() for parts in found)
+
+
+def test_nothing_is_decided_before_the_run_draws_at_full_size(tmp_path):
+    assert transient(trainer(tmp_path, photographs(with_figure)), 5) == []
+
+
+def test_a_cut_out_photograph_is_not_masked_further():
+    pixels = np.full((30, 40, 3), 90, np.uint8)
+    mask = np.full((30, 40), 255, np.uint8)
+    level = Level.from_pixels(camera(40, 30), pixels, mask, TRANSPARENT)
+    assert without(level, np.ones((3, 4), bool)) is level
+
+
+def test_a_mask_of_the_user_stays_ignored():
+    mask = np.full((30, 40), 255, np.uint8)
+    mask[:10] = 0
+    level = Level.from_pixels(camera(40, 30), np.full((30, 40, 3), 90, np.uint8), mask, IGNORE)
+    parts = np.zeros((3, 4), bool)
+    parts[2, 0] = True
+    assert (without(level, parts).mask == 0).sum() == 10 * 40 + 10 * 10
+
+
+def test_a_run_goes_on_with_the_parts_that_it_had_decided_on(tmp_path):
+    made = trainer(tmp_path, photographs(with_figure))
+    before = transient(made)
+    made.save(20)
+    _, state = load_checkpoint(tmp_path, lambda *_: None)
+    again = replace(made)
+    again.begin(wall())
+    for stored, resumed, parts in zip(state.transient, again.transient, before, strict=True):
+        np.testing.assert_array_equal(stored, parts)
+        np.testing.assert_array_equal(resumed, parts)
+
+
+def test_ignored_parts_do_not_move_a_splat(tmp_path):
+    """Steps on photographs with a figure, which is ignored, are those without it."""
+    models = []
+    for change in (with_figure, lambda *_: None):
+        made = trainer(tmp_path, photographs(change))
+        figure = transient(trainer(tmp_path, photographs(with_figure)))
+        made.transient = figure
+        for step in range(40, 60):
+            made.step(step)
+        models.append(made.model.on_host())
+    np.testing.assert_allclose(models[0].sh, models[1].sh, atol=2e-4)
