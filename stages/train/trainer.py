@@ -34,7 +34,7 @@ from stages.train.conversion import initial_model
 from stages.train.dropout import Dropout, uses_dropout
 from stages.train.history import History
 from stages.train.optimiser import LearningRates, Model
-from stages.train.schedule import FULL, Schedule
+from stages.train.schedule import Schedule
 from stages.train.steps.memory_limited import MemoryLimitedStep
 from stages.train.steps.step import StepInput, TrainingStep, step_of
 from stages.train.transients import without
@@ -192,8 +192,9 @@ class Trainer:
         """Which training view `step` uses."""
         return self.schedule.view(step, len(self.task.views))
 
-    def level(self, row: int, number: int = FULL) -> Level:
-        """A level of a training view with its refined camera, and without what moved."""
+    def level(self, row: int, number: int = -1) -> Level:
+        """A level of a training view, by default at full size, with its refined camera and without
+        what moved."""
         level = self.task.views[row].levels[number]
         if self.refinement is not None:
             level = replace(level, camera=self.refinement.camera(row, level.camera))

@@ -4,9 +4,12 @@ Early in a run, before it draws at full size, the model shows what photographs a
 photograph is transient if its mean colour differs from that of the model, and differs more than it
 does in other photographs of the same surface. So what the model shows nowhere, such as fine
 texture, is not transient. Nor are shadows and reflections: at least one of the connected parts
-differs in more than brightness. If few parts are transient, none is: nothing moved, and training
-stays as it is. (RobustNeRF, Sabour et al. 2023, and RobustSplat, 2506.02751, compare residuals
-within one photograph.)
+differs in more than brightness. Training stays as it is if few parts are transient (nothing moved),
+if they are few of those that differ (the model is wrong), or if they are very many (a turntable:
+nobody can tell what should stand still).
+
+RobustNeRF (Sabour et al. 2023) and RobustSplat (2506.02751) compare residuals within one photograph
+instead.
 """
 
 from __future__ import annotations
@@ -38,6 +41,8 @@ WITNESSES = 3  # other photographs that see the surface, at least
 MOST_ASKED = 48  # photographs, of many
 SAME_SURFACE = 0.06  # of the depth
 LEAST_SHARE = 0.005  # of all parts: fewer are chance
+MOST_SHARE = 0.15  # of all parts, with their neighbours
+MOSTLY = 0.5  # of the parts with another colour; else it is the model that is wrong
 
 
 @dataclass(frozen=True)
@@ -96,16 +101,24 @@ class Comparison:
 def transient_parts(views: Sequence[Comparison]) -> list[NDArray[np.bool_]]:
     """For each view [h, w] which parts are transient, with their neighbours."""
     surfaces = [_seen_by_others(view, views) for view in views]
+    in_colour = [view.differences_in_colour for view in views]
     different = _unexpected([view.differences for view in views], surfaces, DIFFERENT)
-    coloured = _unexpected([view.differences_in_colour for view in views], surfaces, OTHER_COLOUR)
-    if not views or np.mean([parts.mean() for parts in coloured]) < LEAST_SHARE:
-        return [np.zeros_like(parts) for parts in coloured]
+    coloured = _unexpected(in_colour, surfaces, OTHER_COLOUR)
+    all_coloured = float(np.mean([(errors > OTHER_COLOUR).mean() for errors in in_colour]))
+    few = _share(coloured) < max(LEAST_SHARE, MOSTLY * all_coloured)
     square = np.ones((3, 3))
     connected = (
         binary_propagation(core, square, mask=core | parts)
         for core, parts in zip(coloured, different, strict=True)
     )
-    return [binary_dilation(parts, square) for parts in connected]
+    found = [binary_dilation(parts, square) for parts in connected]
+    if few or _share(found) > MOST_SHARE:
+        return [np.zeros_like(parts) for parts in found]
+    return found
+
+
+def _share(parts: Sequence[NDArray[np.bool_]]) -> float:
+    return float(np.mean([view.mean() for view in parts]))
 
 
 def without(level: Level, parts: NDArray[np.bool_]) -> Level:

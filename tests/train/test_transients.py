@@ -7,12 +7,22 @@ import pytest
 
 from stages.base.stage import Report
 from stages.raster.draw import render
-from stages.scene import IGNORE, TRANSPARENT, DrawSettings, look_at
+from stages.scene import (
+    IGNORE,
+    TRANSPARENT,
+    DrawSettings,
+    Reconstruction,
+    TrainedSplats,
+    View,
+    look_at,
+)
+from stages.scene.pictures import mask_of
+from stages.train import stage as train
 from stages.train.checkpoint import load_checkpoint
 from stages.train.conversion import model_of
 from stages.train.hooks import Transients
 from stages.train.schedule import HALF_SIZE_END, Schedule
-from stages.train.transients import PARTS, without
+from stages.train.transients import PARTS, save_masks, without
 from stages.train.views import Level
 from tests.scenes import camera, splats
 from tests.train.pictures import trainer_of, view_of
@@ -53,7 +63,10 @@ def trainer(folder, taken, outside="", mask=None, steps=STEPS):
     return made
 
 
-def transient(made, step=round(HALF_SIZE_END * STEPS)):
+FULL_SIZE_FROM = round(HALF_SIZE_END * STEPS)
+
+
+def transient(made, step=FULL_SIZE_FROM):
     """[views] parts of each view after this step."""
     Transients().after_step(made, step)
     return made.transient
@@ -76,6 +89,7 @@ def test_a_figure_in_two_photographs_is_ignored_there_and_nowhere_else(tmp_path)
         figure = np.zeros((HEIGHT, WIDTH), bool)
         figure[FIGURE] = True
         assert level.outside == IGNORE
+        assert level.mask is not None
         assert (level.mask[figure] == 0).all()
         assert (level.mask[~figure] == 0).mean() < 0.1
 
@@ -117,19 +131,41 @@ def test_a_mask_of_the_user_stays_ignored():
     level = Level.from_pixels(camera(40, 30), np.full((30, 40, 3), 90, np.uint8), mask, IGNORE)
     parts = np.zeros((3, 4), bool)
     parts[2, 0] = True
-    assert (without(level, parts).mask == 0).sum() == 10 * 40 + 10 * 10
+    ignored = without(level, parts).mask
+    assert ignored is not None
+    assert np.count_nonzero(ignored == 0) == 10 * 40 + 10 * 10
 
 
 def test_a_run_goes_on_with_the_parts_that_it_had_decided_on(tmp_path):
     made = trainer(tmp_path, photographs(with_figure))
     before = transient(made)
     made.save(20)
-    _, state = load_checkpoint(tmp_path, lambda *_: None)
+    stored = load_checkpoint(tmp_path, lambda *_: None)
+    assert stored is not None
     again = replace(made)
     again.begin(wall())
-    for stored, resumed, parts in zip(state.transient, again.transient, before, strict=True):
-        np.testing.assert_array_equal(stored, parts)
+    for read, resumed, parts in zip(stored[1].transient, again.transient, before, strict=True):
+        np.testing.assert_array_equal(read, parts)
         np.testing.assert_array_equal(resumed, parts)
+
+
+def test_later_stages_ignore_the_same_parts(tmp_path):
+    taken = photographs(with_figure)
+    made = trainer(tmp_path, taken)
+    levels = [made.level(row) for row in range(len(taken))] if transient(made) else []
+    names = [view.name for view in made.task.views]
+    masks = save_masks(tmp_path, names, levels, made.transient)
+    assert sorted(masks) == ["1", "4"]
+    train.save(tmp_path, TrainedSplats(wall(), masks=masks))
+    found = train.load(tmp_path).masks
+    views = tuple(View(str(i), f"{i}.png", where) for i, (_, where) in enumerate(taken))
+    no_points = (np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), np.zeros(0, np.int32))
+    reconstruction = Reconstruction(tmp_path, views, *no_points)
+    for view, level in zip(reconstruction.with_masks(found).views, levels, strict=True):
+        mask = mask_of(tmp_path, view, WIDTH, HEIGHT)
+        assert (mask is None) == (level.mask is None)
+        if mask is not None:
+            np.testing.assert_array_equal(mask, level.mask)
 
 
 def test_ignored_parts_do_not_move_a_splat(tmp_path):
