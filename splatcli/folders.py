@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from splatcli import console
-from stages.base.errors import RunFolderError, SplatError, UsageError
+from stages.base.errors import SplatError, UsageError
 from stages.run import results, runfolder
 from stages.run.pipeline import Pipeline
 from stages.scene import Splats
@@ -54,12 +54,7 @@ def find_run_folder(named: Path | None = None) -> Path:
             wanted="One of them.",
             hint=f"Name it: splat status {folders[0]}",
         )
-    raise RunFolderError(
-        "run-folder-missing",
-        given=f"There is no run folder in {here.resolve()}.",
-        wanted="A run folder, named or in the current folder.",
-        hint="Start one with `splat process PHOTOS`, or name one that exists.",
-    )
+    raise runfolder.missing(here.resolve())
 
 
 def _is_readable_run_folder(path: Path) -> bool:

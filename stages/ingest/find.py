@@ -221,13 +221,6 @@ def _is_hidden(name: str) -> bool:
 
 
 def _check_folder(folder: Path) -> None:
-    if not folder.exists():
-        raise SplatError(
-            "ingest-no-such-folder",
-            given=f"{folder} does not exist.",
-            wanted="A folder of photographs, or a video.",
-            hint="Check the spelling, or drag the folder into the terminal to get its full name.",
-        )
     if folder.is_dir():
         return
     if folder.suffix.lower() in PICTURES:

@@ -124,5 +124,5 @@ def missing(folder: Path) -> SplatError:
         "run-folder-missing",
         given=f"{folder} is not a run folder.",
         wanted="A folder that `splat process` made.",
-        hint="Start one: splat process PHOTOS --out run/",
+        hint="Name one, or start one: splat process PHOTOS --out run/",
     )
