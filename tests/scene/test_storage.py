@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from stages.base.errors import Family, SplatError
-from stages.scene import Splats, load_splats, save_splats
+from stages.scene import Splats, load_splats, save_splats, storage
 from stages.scene.storage import FIELDS
 
 
@@ -77,3 +77,12 @@ def test_an_unwritable_place_is_an_error_of_its_own(tmp_path: Path) -> None:
         save_splats(tmp_path / "missing" / "a", some_splats(1))
     assert caught.value.family == Family.RESOURCES
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_of_an_earlier_version_with_a_sixth_draw_setting_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    splats = some_splats(5).with_antialias(True)
+    monkeypatch.setattr(storage, "astuple", lambda settings: (*astuple(settings), 1.0))
+    save_splats(tmp_path / "six.bin", splats)
+    assert load_splats(tmp_path / "six.bin").draw_settings == splats.draw_settings
