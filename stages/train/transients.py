@@ -37,8 +37,8 @@ DIFFERENT = 0.1  # length of the difference of two colours, 0..1 in each channel
 OTHER_COLOUR = 0.08  # the same, after the drawing was made darker or brighter
 MOST_DARKER = 0.5  # at most so much, or as much brighter
 TIMES_OTHERS = 2.0  # the median difference of the other photographs
-WITNESSES = 3  # other photographs that see the surface, at least
-MOST_ASKED = 48  # photographs, of many
+OTHER_VIEWS = 3  # other photographs that see the surface, at least
+MOST_COMPARED = 48  # photographs, of many
 SAME_SURFACE = 0.06  # of the depth
 LEAST_SHARE = 0.005  # of all parts: fewer are chance
 MOST_SHARE = 0.15  # of all parts, with their neighbours
@@ -153,7 +153,7 @@ def _seen_by_others(view: Comparison, views: Sequence[Comparison]) -> dict[int, 
     depths = view.depth.ravel().astype(np.float64)
     points = unproject(view.camera, pixel_centres(rows, columns), depths)
     seen = {}
-    for number in evenly_spaced(range(len(views)), MOST_ASKED):
+    for number in evenly_spaced(range(len(views)), MOST_COMPARED):
         other = views[number]
         if other is view:
             continue
@@ -172,13 +172,13 @@ def _unexpected(
     least: float,
 ) -> list[NDArray[np.bool_]]:
     """[h, w] for each view: whether the error of a part is at least `least`, and TIMES_OTHERS the
-    median of its surface's in WITNESSES other views or more."""
+    median of its surface's in OTHER_VIEWS other views or more."""
     found = []
     for own, seen in zip(errors, surfaces, strict=True):
         others = np.full((max(1, len(seen)), own.size), np.nan, np.float32)
         for row, (number, at) in zip(others, seen.items(), strict=False):
             row[at >= 0] = errors[number].ravel()[at[at >= 0]]
-        enough = np.isfinite(others).sum(axis=0) >= WITNESSES
+        enough = np.isfinite(others).sum(axis=0) >= OTHER_VIEWS
         expected = np.full(own.size, np.inf, np.float32)
         if enough.any():
             expected[enough] = np.nanmedian(others[:, enough], axis=0)
