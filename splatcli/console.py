@@ -194,6 +194,7 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[str]], title: str = "
     """Print a table; columns of figures are aligned right."""
     rows = [list(map(str, row)) for row in rows]
     drawn = Table(title=title or None, title_justify="left", box=None, pad_edge=False)
+    drawn.show_header = any(headings)
     for i, heading in enumerate(headings):
         figures = all(row[i][:1].isdigit() or row[i] in ("", "-") for row in rows)
         drawn.add_column(heading, justify="right" if figures and i else "left", overflow="fold")
@@ -237,7 +238,7 @@ def note_compiling() -> None:
         note("Compiling the kernels; this is done once and takes about half a minute.")
 
 
-_UNITS = {"_db": " dB", "_px": " px", "_s": " s", "_mib": " MB", "_deg": "°"}
+_UNITS = {"_bytes": " B", "_db": " dB", "_px": " px", "_s": " s", "_mib": " MB", "_deg": "°"}
 
 
 def figures(numbers: Mapping[str, Any]) -> str:
@@ -256,10 +257,14 @@ def label(name: str) -> str:
 def figure(name: str, value: Any) -> str:
     """A figure with its unit."""
     unit = next((u for suffix, u in _UNITS.items() if name.endswith(suffix)), "")
+    if name == "verify_db":
+        return fidelity(value)
     if isinstance(value, bool):
         return "yes" if value else "no"
     if name.endswith("_mib"):
         return size(value * 2**20)
+    if name.endswith("_bytes"):
+        return size(value)
     if isinstance(value, int):
         return f"{value:,}{unit}"
     if isinstance(value, float):

@@ -145,13 +145,11 @@ def _rounded(values: Any) -> list[float]:
 def _text(name: str, value: Any) -> str:
     """A fact as text for the table."""
     if name == "assets":
-        return ", ".join(f"{path}: {_asset_text(**facts)}" for path, facts in value.items())
+        return "\n".join(f"{path}: {_asset_text(**facts)}" for path, facts in value.items())
     if isinstance(value, dict):
         return ", ".join(f"{key}: {_text(name, item)}" for key, item in value.items())
     if isinstance(value, list):
-        return " ".join(map(str, value))
-    if name in ("size_bytes", "memory_bytes"):
-        return console.size(value)
+        return ",".join(map(str, value))  # as `splat edit` takes coordinates
     return console.figure(name, value)
 
 

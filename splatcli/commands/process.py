@@ -81,6 +81,7 @@ def _run_folder_and_photos(photos: Path | None, out: Path | None) -> tuple[Path,
             )
         return photos, None
     folder = out or run_folder_for(photos)
+    runfolder.check_photos(folder, photos)  # before anything is said of the run
     if out is None and folder != DEFAULT and console.mode.has_notes:
         console.note(f"Run folder: {folder}, since {DEFAULT} holds a run of other photographs.")
     return folder, photos

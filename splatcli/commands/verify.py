@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,6 +24,7 @@ from stages.run import results, runfolder
 from stages.run.pipeline import Pipeline
 from stages.scene import QuantisedSplats, View
 
+_FEW = ("splats", "bytes_per_splat", "verify_db", "verify_mean_db")  # of several files
 _ELSEWHERE = 1e-6  # units between two origins
 
 
@@ -173,19 +173,36 @@ def _print(proofs: list[tuple[Path, Proof]], original: _Original, losses: list[s
             what = each["fault"] or console.fidelity(each["verify_db"])
             console.out.print(f"{each['file']}: {what}", markup=False)
         return
-    hidden = {"file", "size_bytes", "against", "right", "fault"}
-    hidden |= {"worst_attribute", "worst_splat"}
-    shown = [name for name in dict.fromkeys(chain(*facts)) if name not in hidden]
-    rows = [
-        (_label(name), *(_figure(name, each.get(name, "-")) for each in facts)) for name in shown
-    ]
-    rows.append(("worst", *map(_worst, facts)))
-    rows.append(("verdict", *("wrong" if each["fault"] else "right" for each in facts)))
-    console.table(
-        ("", *(file.name for file, _ in proofs)), rows, title=f"Compared with {original.name}"
-    )
+    if len(facts) > 1:
+        _print_several(facts, original)
+    else:
+        _print_one(facts[0], original)
     for loss in losses:
         console.warn(f"Warning: {loss}")
+
+
+def _print_several(facts: list[dict[str, Any]], original: _Original) -> None:
+    rows = [
+        (
+            Path(each["file"]).name,
+            *(_figure(name, each.get(name, "-")) for name in _FEW),
+            _worst(each),
+            "wrong" if each["fault"] else "right",
+        )
+        for each in facts
+    ]
+    headings = ("file", *map(_label, _FEW), "largest change", "verdict")
+    console.table(headings, rows, title=f"Compared with {original.name}")
+
+
+def _print_one(facts: dict[str, Any], original: _Original) -> None:
+    hidden = {"file", "size_bytes", "against", "right", "fault"}
+    hidden |= {"worst_attribute", "worst_splat"}
+    rows = [(_label(name), _figure(name, facts[name])) for name in facts if name not in hidden]
+    rows.append(("worst", _worst(facts)))
+    rows.append(("verdict", "wrong" if facts["fault"] else "right"))
+    headings = ("", Path(facts["file"]).name)
+    console.table(headings, rows, title=f"Compared with {original.name}")
 
 
 def _worst(facts: dict[str, Any]) -> str:

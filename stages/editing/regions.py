@@ -34,7 +34,7 @@ def parse_region(text: str) -> Inside:
         given=f"{text[:100]!r} is no region of space.",
         wanted="box:x0,y0,z0,x1,y1,z1 with its lowest corner first, sphere:x,y,z,r, or lasso: and "
         "its numbers.",
-        hint="`splat info` prints the bounds; the page of `splat view` writes a lasso.",
+        hint="`splat info` prints the bounds; under Select, the page of `splat view` names points.",
     )
 
 

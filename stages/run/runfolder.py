@@ -36,7 +36,7 @@ def opened(folder: Path, photos: Path | None) -> Iterator[None]:
     run-folder-busy, and those of `RunFile.read`, before anything is written), OSError.
     """
     if photos is not None:
-        _check_photos(folder, photos)
+        check_photos(folder, photos)
     if not is_run_folder(folder):
         if photos is None:
             raise missing(folder)
@@ -86,7 +86,8 @@ def _same(photos: Path, first_stage_folder: Path) -> bool:
     return combined_digest(record_files(photos, users=True)) == done.inputs.get(PHOTOS)
 
 
-def _check_photos(folder: Path, photos: Path) -> None:
+def check_photos(folder: Path, photos: Path) -> None:
+    """Raise SplatError where `photos` cannot be those of a run in `folder`."""
     if not photos.exists():
         raise SplatError(
             "photographs-missing",

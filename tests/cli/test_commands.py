@@ -131,6 +131,11 @@ def test_code_of_photographs_that_are_not_there_is_the_documented_one(splat) -> 
     assert "at the path given" in row
 
 
+def test_of_photographs_that_are_not_there_nothing_is_said_of_the_run_that_is(splat) -> None:
+    splat("process", "photos")
+    assert splat("process", "nope").stderr.startswith("Error: ")
+
+
 def test_every_command_has_json_and_says_that_outputs_were_verified(splat) -> None:
     assert all(AS_JSON in entry.added for entry in ENTRIES.values())
     splat("process", "photos")

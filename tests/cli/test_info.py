@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,17 @@ def test_values_that_are_not_finite_are_described_and_not_refused(tmp_path: Path
     result = CliRunner().invoke(app, ["info", str(path)])
     assert result.exit_code == 0
     assert "5 splats (1.7 %) are not finite in their positions" in result.stderr
+
+
+def test_the_table_has_no_empty_line_and_coordinates_as_other_commands_take_them(
+    tmp_path: Path,
+) -> None:
+    formats.write(tmp_path / "a.ply", many_splats(300))
+    lines = CliRunner().invoke(app, ["info", str(tmp_path / "a.ply")]).stdout.splitlines()
+    assert all(line.strip() for line in lines)
+    low = next(line for line in lines if line.startswith("bounds low")).split()[-1]
+    assert len([float(value) for value in low.split(",")]) == 3
+    assert any(re.fullmatch(r"size +\d+\.\d kB", line.strip()) for line in lines)
 
 
 def test_a_damaged_file_stays_an_error(tmp_path: Path) -> None:

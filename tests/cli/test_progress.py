@@ -62,6 +62,11 @@ def test_a_new_phase_is_printed_at_once(clock, lines) -> None:
     assert lines[1:] == ["  finding features: 0/24", "  registering photographs: 0/24"]
 
 
+def test_equal_pictures_are_exact_in_the_bar_too() -> None:
+    assert console.figures({"verify_db": 99.0}) == "verify exact"
+    assert console.figures({"verify_db": 38.28}) == "verify 38.28 dB"
+
+
 def test_slow_units_are_seconds_each(clock, lines) -> None:
     listener = progress.Lines()
     listener.progressed(STAGE, "matching", 0, 3, {})

@@ -56,6 +56,20 @@ def test_the_last_lines_are_the_verdict_and_how_to_look_at_the_result(
     assert lines[-1] == "Look at it: splat view run"
 
 
+def test_a_terminal_breaks_the_verdict_between_words(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    text = "Usable: " + " ".join(["photographs"] * 20)
+    for terminal in (True, False):
+        monkeypatch.setattr(console.out, "_force_terminal", terminal)
+        lines = shown(capsys, {"grade": "good", "text": text}).splitlines()
+        verdict = lines[next(i for i, line in enumerate(lines) if "Usable" in line) : -1]
+        assert len(verdict) == (4 if terminal else 1)
+        words = re.sub(r"\x1b\[[0-9;]*m", "", " ".join(verdict)).split()
+        assert " ".join(words).startswith(text)
+
+
 def test_memory_is_in_the_unit_of_the_files(capsys: pytest.CaptureFixture[str]) -> None:
     out = shown(capsys, {"grade": "good", "text": "Good."})
     assert "105 MB" in out or "104.9 MB" in out
