@@ -182,10 +182,10 @@ def test_a_click_names_the_place_and_several_make_a_box(browser: Browser, tmp_pa
     wall = scenes.splats(np.stack([x, y, 4 + 0.1 * x], -1).reshape(-1, 3), 0.1, 0.9)
     scene = scenes.join(wall, scenes.splats([[0, 0, 1.0]], 0.1, 0.1), wall.take(slice(0, 1)))
     ply.write(tmp_path / "scene.ply", scene)
-    asked: list[dict[str, str]] = []
+    queries: list[dict[str, str]] = []
 
     def record(query: dict[str, str]) -> Item:
-        asked.append(query)
+        queries.append(query)
         return Item(b"", "text/plain")
 
     items = site("wall", scene, tmp_path / "scene.ply", (View("a.jpg", "", camera),))
@@ -206,8 +206,8 @@ def test_a_click_names_the_place_and_several_make_a_box(browser: Browser, tmp_pa
         shown = browser.run("document.getElementById('chosen').textContent")
         server.shutdown()
     assert shown.startswith("0.5,1.2,4.05: ")
-    found = [tuple(map(float, query["at"].split(","))) for query in asked]
+    found = [tuple(map(float, query["at"].split(","))) for query in queries]
     np.testing.assert_allclose(found, places, atol=1e-3)
-    assert [query.get("box") for query in asked[:2]] == [None, "0,-0.5,4,1,0,4.1"]
-    assert asked[2]["box"] == "0,-0.5,4,1,1.2,4.1"
+    assert [query.get("box") for query in queries[:2]] == [None, "0,-0.5,4,1,0,4.1"]
+    assert queries[2]["box"] == "0,-0.5,4,1,1.2,4.1"
     assert not browser.run("document.getElementById('keep').disabled")
