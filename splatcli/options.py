@@ -103,7 +103,9 @@ def shown_default(setting: Setting) -> str | bool:
         return False
     if isinstance(value, (tuple, list)):
         return " ".join(map(str, value))
-    return {True: "yes", False: "no"}[value] if isinstance(value, bool) else str(value)
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def given_only(given: Mapping[str, Any]) -> dict[str, Any]:

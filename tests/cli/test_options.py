@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from splatcli import console, options
 from stages.base.errors import SplatError
-from stages.base.settings import setting
+from stages.base.settings import Setting, setting
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,12 @@ def parse(*words: str) -> dict:
     app.command()(options.with_parameters(command, options.parameters(Settings)))
     CliRunner().invoke(app, list(words), catch_exceptions=False)
     return seen
+
+
+def test_defaults_are_shown_as_they_are_typed() -> None:
+    values = (0.0, 0.25, False, 1600)
+    shown = [options.shown_default(Setting("x", "--x", type(v), default=v)) for v in values]
+    assert shown == ["0", "0.25", "no", "1600"]
 
 
 def test_only_what_was_typed_is_given() -> None:
