@@ -1,7 +1,9 @@
-"""Number of threads, and OpenMP's settings, made before torch, Numba or OpenCV load.
+"""Number of threads, and settings of OpenMP and OpenBLAS, made before NumPy, torch, Numba or OpenCV
+load.
 
-By default OpenMP's threads spin while they wait. If another process uses the same cores, training
-then takes ten times as long.
+By default their threads spin while they wait. If another process uses the same cores, training
+then takes ten times as long. The matrices here are small: OpenBLAS takes 60 times as long to solve
+100 equations with two threads as with one.
 """
 
 from __future__ import annotations
@@ -10,8 +12,9 @@ import os
 
 
 def configure() -> None:
-    """Set OpenMP's waiting policy, unless the user has set it."""
+    """Set OpenMP's waiting policy and one thread for OpenBLAS, unless the user has set them."""
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def count() -> int:
