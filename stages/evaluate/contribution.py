@@ -75,8 +75,7 @@ class Contributions:
     previous: Contributions | None = None
 
     def take(self, rows: NDArray[np.bool_]) -> Contributions:
-        """The contributions of these splats only, as a start of a further measurement. The
-        truncated figures are not reduced."""
+        """The contributions of these splats only."""
         return replace(
             self,
             sse_change=self.sse_change[rows],
@@ -84,6 +83,10 @@ class Contributions:
             weight=self.weight[rows],
             kept_weight=self.kept_weight[rows],
             view_counts=self.view_counts[rows],
+            truncated_sse_change=self.truncated_sse_change[rows],
+            truncated_picture_change=self.truncated_picture_change[rows],
+            truncated_colour=self.truncated_colour[rows],
+            previous=self.previous and self.previous.take(rows),
             sh_sums=tuple(sums[rows] for sums in self.sh_sums),
         )
 

@@ -28,7 +28,11 @@ from stages.prune.targets import Psnr, Targets
 from stages.scene import Splats, evenly_spaced
 from stages.train.finetune import FineTuner
 
-HALVINGS = 3  # of the share of splats that a round removes, after rounds that cost too much
+SMALLEST_SHARE = ROUND_SHARE / 8  # of the splats, that a round removes
+# A round that costs too much, or is predicted to, is tried again with fewer splats: as many as cost
+# AIM of what is allowed, if the loss grows with this power of their number.
+AIM, POWER = 0.95, 1.6
+PESSIMISM = 1.15  # x the predicted loss: splats that go together miss each other
 TINY = float(np.finfo(np.float64).tiny)
 # why pruning stopped
 RATE_DISTORTION, LOSS, ROUNDS, TIME = "rate_distortion", "loss", "rounds", "time"
@@ -148,9 +152,9 @@ class Pruner:
             if excess <= 0 and time.monotonic() > self.deadline:
                 found.stopped_by = TIME
                 break
-            removal = self._select(found, state, excess, share)
+            removal, share = self._affordable(found, state, best_db, excess, share)
             if removal is None:
-                found.stopped_by = RATE_DISTORTION
+                found.stopped_by = RATE_DISTORTION if share >= SMALLEST_SHARE else LOSS
                 break
             fewer = removal.apply(found.splats)
             after = self._measure(fewer, state, removal)
@@ -167,9 +171,7 @@ class Pruner:
                 # what fine-tuning gains is not added to the loss allowed
                 best_db = max(best_db, after.psnr_db, key=np.mean)
                 continue
-            share, found.stopped_by = share / 2, LOSS
-            if share < ROUND_SHARE / 2**HALVINGS:
-                break
+            share, found.stopped_by = self._smaller(share, after.psnr_db, state, best_db), LOSS
         found.end_db = float(state.psnr_db.mean())
         self.targets.check_end(found.splats, found.end_db)
         return found
@@ -180,10 +182,13 @@ class Pruner:
         removal = select_removal(found.splats, state, self._cameras, RemovalLimits(0.0, most))
         if removal is None:
             return state
-        fewer = removal.apply(found.splats)
-        after = self._measure(fewer, state, removal)
-        kept = self.targets.allows(after.psnr_db, state.psnr_db)
-        found.add_round(removal, self._sse_change(state, after), after.psnr_db, kept)
+        fewer, kept = removal.apply(found.splats), True
+        after, measured = state.take(~removal.removed), removal.predicted_sse
+        if removal.floaters:  # the others do not show
+            after = self._measure(fewer, state, removal)
+            kept = self.targets.allows(after.psnr_db, state.psnr_db)
+            measured = self._sse_change(state, after)
+        found.add_round(removal, measured, after.psnr_db, kept)
         if not kept:
             return state
         found.splats = fewer
@@ -233,6 +238,30 @@ class Pruner:
             return self.rounds
         needed = math.log(left / len(splats)) / math.log(1 - ROUND_SHARE)
         return max(self.rounds, math.ceil(needed) + 4)
+
+    def _affordable(
+        self, found: PruningResult, state: Contributions, best_db: Psnr, excess: int, share: float
+    ) -> tuple[Removal | None, float]:
+        """(what the next round removes, its share of the splats): the largest removal whose
+        predicted loss is allowed, or one that a target needs; None if there is none."""
+        while share >= SMALLEST_SHARE:
+            removal = self._select(found, state, excess, share)
+            if removal is None or excess > 0 or self.targets.min_psnr_db:
+                return removal, share
+            ratio = 1 + removal.predicted_sse / max(state.sse, TINY)
+            predicted_db = state.psnr_db - PESSIMISM * 10 * math.log10(max(ratio, TINY))
+            if self.targets.allows(predicted_db, best_db):
+                return removal, share
+            share = self._smaller(share, predicted_db, state, best_db)
+        return None, share
+
+    def _smaller(self, share: float, psnr_db: Psnr, state: Contributions, best_db: Psnr) -> float:
+        """The share of the splats to try after one that leads from `state` to `psnr_db`."""
+        if self.targets.min_psnr_db:
+            return share / 2
+        before, used = (self.targets.used(best_db - db) for db in (state.psnr_db, psnr_db))
+        left = AIM * max(0.0, 1.0 - before) / max(used - before, TINY)
+        return float(share * min(0.9, left ** (1 / POWER)))
 
     def _select(
         self, found: PruningResult, state: Contributions, excess: int, share: float

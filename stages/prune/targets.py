@@ -51,12 +51,16 @@ class Targets:
         views that are not trained on."""
         if self.min_psnr_db:
             return float(psnr_db.mean()) >= self.min_psnr_db
-        return not self.broken_by((best_db - psnr_db) / MARGIN)
+        return self.used(best_db - psnr_db) <= 1
+
+    def used(self, loss_db: Psnr) -> float:
+        """What training views lose [V], as a share of what they may."""
+        mean, worst = (float(f(loss_db)) / (MARGIN * self.strength) for f in (np.mean, np.max))
+        return max(mean / max(self.max_loss_db, 1e-9), worst / WORST_VIEW_DB)
 
     def broken_by(self, loss_db: Psnr) -> bool:
-        """Whether views lose more than the strength allows. loss_db: [V]."""
-        mean, worst = (float(f(loss_db)) / self.strength for f in (np.mean, np.max))
-        return mean > self.max_loss_db or worst > WORST_VIEW_DB
+        """Whether held-out views lose more than the strength allows. loss_db: [V]."""
+        return self.used(MARGIN * loss_db) > 1
 
     def check_start(self, psnr_db: float) -> None:
         """Raises SplatError (prune-psnr-not-reached) if even the unpruned model is below."""
