@@ -98,6 +98,12 @@ def _fill(
     _, pixels, _ = visible_points(camera, np.concatenate([filling.points, *filling.positions]))
     sampled = _one_per_quarter_cell(*visible_points(camera, filling.points)[1:])
     empty = _empty_cells(camera, pixels)
+    rows, columns = cells(empty - margin)
+    at = rows.clip(0, small.height - 1), columns.clip(0, small.width - 1)
+    mask = mask_of(folder, view, small.width, small.height)
+    if mask is not None:
+        solid = mask[at] > SOLID
+        empty, at = empty[solid], (at[0][solid], at[1][solid])
     if len(sampled[1]) < PLANE_POINTS or len(empty) == 0:
         return
     depth = _interpolated(empty, *sampled)
@@ -111,11 +117,6 @@ def _fill(
     if not free.any():
         return
     picture = load_image(folder / view.image, small.width, small.height)
-    rows, columns = cells(empty - margin)
-    at = rows.clip(0, small.height - 1), columns.clip(0, small.width - 1)
-    mask = mask_of(folder, view, small.width, small.height)
-    if mask is not None:
-        free &= mask[at] > SOLID
     filling.positions.append(positions[free])
     filling.colours.append(picture[at][free])
     filling.scales.append(SCALE * depth[free] / camera.fx)
@@ -136,8 +137,11 @@ def _supported_depth(
     supported &= visibility.close_to_points(positions)
     far = float(np.percentile(depths, FAR_PERCENTILE))
     moved = np.where(supported, depth, np.maximum(depth, far))
-    _, occluding = visibility.count(unproject(camera, at, moved), view.name)
-    return moved, supported | ((occluding == 0) & (moved > depth))
+    filled = supported.copy()
+    rows = np.flatnonzero(~supported & (moved > depth))
+    _, occluding = visibility.count(unproject(camera, at[rows], moved[rows]), view.name)
+    filled[rows] = occluding == 0
+    return moved, filled
 
 
 def _in_any_picture(positions: NDArray[np.float64], views: tuple[View, ...]) -> NDArray[np.bool_]:

@@ -186,8 +186,10 @@ def _values(
     for number, path in enumerate(pictures):
         tick(number + 1)
         mine = np.flatnonzero(views == number)
+        if not len(mine):
+            continue
         picture = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR_RGB)
-        if picture is None or not len(mine):
+        if picture is None:
             continue
         height, width = (max(1, side // DOWNSCALE) for side in picture.shape[:2])
         small = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)

@@ -105,17 +105,24 @@ def _write_picture(photo: Photo, source: Path, folder: Path, tables: _Tables | N
     image = read_picture(source / photo.image)
     target = folder / IMAGES / photo.picture
     if tables is None:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(target) as partial:
-            shutil.copyfile(source / photo.image, partial)
+        _copy(source / photo.image, target)
     else:
         write_picture_as(
             target, cv2.remap(image, *tables, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         )
 
 
+def _copy(source: Path, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(target) as partial:
+        shutil.copyfile(source, partial)
+
+
 def _write_mask(photo: Photo, source: Path, folder: Path, tables: _Tables | None) -> None:
     if not photo.mask:
+        return
+    if tables is None and Path(photo.mask).suffix == ".png":
+        _copy(source / photo.mask, folder / mask_file(photo))
         return
     mask = read_picture(source / photo.mask)[..., 0]
     if tables is not None:

@@ -198,7 +198,7 @@ def _match(
     prepare_work_folder(work, project, sift, known, pairs, refine)
     for job in (
         Features(project, sift),
-        Neighbours(project, known.intrinsics, pairs),
+        Neighbours(project, known, pairs),
         Triangulation(project, out, known, refine),
     ):
         marker = work / f"{job.step}.done"

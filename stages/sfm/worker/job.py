@@ -174,10 +174,10 @@ class Mapping(Job):
 
 @dataclass(frozen=True)
 class Neighbours(Job):
-    """Match and verify `pairs` of photographs with known intrinsics [P, 4] (fx, fy, cx, cy)."""
+    """Match and verify `pairs` of photographs with known cameras."""
 
     step = "neighbours"
-    intrinsics: NDArray[np.float64]
+    cameras: KnownCameras
     pairs: tuple[Pair, ...]
 
 

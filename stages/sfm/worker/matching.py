@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 
@@ -36,6 +36,11 @@ FEWEST_COMPARED_SMALL = 64  # as `vocabulary.FEWEST_COMPARED`, for pair selectio
 FEWEST_INLIERS = 15  # as in COLMAP
 MOST_TRIALS = 3000  # of RANSAC, for pairs with few inliers
 _CACHED = 256  # photographs whose feature indices stay in memory
+# (pair, matches [M, 2], their pixels in both photographs [M, 2]) -> geometry, None if unknown
+Pixels = NDArray[np.float64]
+KnownGeometry = Callable[
+    [Pair, NDArray[np.uint32], Pixels, Pixels], pycolmap.TwoViewGeometry | None
+]
 
 
 def match_all(job: Matching) -> None:
@@ -45,21 +50,22 @@ def match_all(job: Matching) -> None:
             matcher.run(wanted)
 
 
-def match_pairs(project: Project, wanted: Sequence[Pair]) -> None:
-    """Match and verify the `wanted` pairs, except those that the database holds."""
-    with _matcher(project) as matcher:
+def match_pairs(project: Project, wanted: Sequence[Pair], known: KnownGeometry) -> None:
+    """Match and verify the `wanted` pairs, except those that the database holds. known: is asked
+    before two-view geometry is estimated."""
+    with _matcher(project, known) as matcher:
         matcher.run(wanted)
 
 
 @contextmanager
-def _matcher(project: Project) -> Iterator[_Matcher]:
+def _matcher(project: Project, known: KnownGeometry | None = None) -> Iterator[_Matcher]:
     """A matcher. Its reader is closed before its writer, because the last to close a database
     tidies it up."""
     with (
         pycolmap.Database.open(project.database) as database,
         closing(sqlite.StoredFeatures(project.database)) as stored,
     ):
-        yield _Matcher(project, database, _IndexedFeatures(project, stored))
+        yield _Matcher(project, database, _IndexedFeatures(project, stored), known)
 
 
 def _rounds(
@@ -126,8 +132,9 @@ class _Matcher:
         project: Project,
         database: pycolmap.Database,
         features: _IndexedFeatures,
+        known: KnownGeometry | None,
     ) -> None:
-        self.features = features
+        self.features, self._known = features, known
         self.inliers = sqlite.inliers_of_pairs(project.database)
         self._project, self._database = project, database
         self._cameras = cameras_of(project, database)
@@ -153,8 +160,11 @@ class _Matcher:
         """(matches, two-view geometry; without inliers if it has too few)."""
         matches = match_descriptors(*map(self.features.index, pair))
         sides = [(self._cameras[position], self.features.points(position)) for position in pair]
-        geometry = two_view_geometry(sides[0], sides[1], matches, self._project.seed)
-        return matches, geometry
+        known = None
+        if self._known and len(matches) >= FEWEST_INLIERS:
+            matched = (points[matches[:, k]] for k, (_, points) in enumerate(sides))
+            known = self._known(pair, matches, *matched)
+        return matches, known or two_view_geometry(sides[0], sides[1], matches, self._project.seed)
 
 
 def cameras_of(project: Project, database: pycolmap.Database) -> list[pycolmap.Camera]:

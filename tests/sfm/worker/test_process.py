@@ -58,8 +58,8 @@ def test_known_cameras_survive_being_written_exactly(tmp_path: Path) -> None:
     assert (read.project, read.out, read.refine) == (project, tmp_path / "out", True)
     for name, values in vars(cameras).items():
         np.testing.assert_array_equal(getattr(read.cameras, name), values)
-    neighbours = Job.read(Neighbours(project, cameras.intrinsics, ((0, 1),)).write(file))
-    np.testing.assert_array_equal(neighbours.intrinsics, cameras.intrinsics)
+    neighbours = Job.read(Neighbours(project, cameras, ((0, 1),)).write(file))
+    np.testing.assert_array_equal(neighbours.cameras.intrinsics, cameras.intrinsics)
 
 
 def test_success_ticks_at_least_at_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
