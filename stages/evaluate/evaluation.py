@@ -101,12 +101,14 @@ class EvaluationView:
 @dataclass(frozen=True)
 class Score:
     """How near one drawing is to its photograph, by the definitions in `image_metrics`. psnr_db: at
-    most `IDENTICAL_DB`. flip: None where it was not computed."""
+    most `IDENTICAL_DB`. flip: None where it was not computed. inside_db: PSNR inside the mask of a
+    transparent photograph."""
 
     name: str
     psnr_db: float
     ssim: float
     flip: float | None = None
+    inside_db: float | None = None
 
 
 class _EvaluationViews(Sequence[EvaluationView]):
@@ -176,9 +178,9 @@ def load_evaluation_view(folder: Path, view: View, camera: Camera) -> Evaluation
     return EvaluationView(view.name, camera, pixels, mask, view.outside)
 
 
-def evaluation_subset(count: int) -> range:
-    """Indices of at most `LARGEST_SUBSET` of `count` views, evenly spaced."""
-    return range(0, count, max(1, -(-count // LARGEST_SUBSET)))
+def evaluation_subset(count: int, most: int = LARGEST_SUBSET) -> range:
+    """Indices of at most `most` of `count` views, evenly spaced."""
+    return range(0, count, max(1, -(-count // most)))
 
 
 def evaluate(
@@ -207,7 +209,7 @@ def evaluate_at_sizes(
         draw: draws a camera's picture, at the camera's size.
         views: at the full size; smaller photographs are area averages, see `EvaluationView.scaled`.
         sizes: the scale of each side, at most 1, by name.
-        with_flip: as in `evaluate`.
+        with_flip: as in `evaluate`, of the full size.
 
     Returns:
         The scores of the views by the name of the size.
@@ -219,9 +221,13 @@ def evaluate_at_sizes(
             view = full.scaled(scale)
             image, truth = np.clip(draw(view.camera), 0.0, 1.0), view.image
             valid = view.valid
-            error = flip(image, truth, valid) if number in with_flip_too else None
+            flips = scale == 1 and number in with_flip_too
+            error = flip(image, truth, valid) if flips else None
             psnr_db, similarity = capped_psnr_db(image, truth, valid), ssim(image, truth, valid)
-            scores[name].append(Score(view.name, psnr_db, similarity, error))
+            inside_db = None
+            if view.mask is not None and view.outside == TRANSPARENT:
+                inside_db = capped_psnr_db(image, truth, view.mask > 0)
+            scores[name].append(Score(view.name, psnr_db, similarity, error, inside_db))
     return scores
 
 
@@ -258,17 +264,6 @@ def _affinely_mapped(
         gain, offset = np.linalg.lstsq(known, truth[where][:, channel], rcond=None)[0]
         found[..., channel] = gain * found[..., channel] + offset
     return found
-
-
-def psnr_inside_masks_db(draw: ImageRenderer, views: Iterable[EvaluationView]) -> float | None:
-    """Mean PSNR over the pixels inside the masks of transparent photographs; None if there is
-    none."""
-    found = [
-        capped_psnr_db(draw(view.camera), view.image, view.mask > 0)
-        for view in views
-        if view.mask is not None and view.outside == TRANSPARENT
-    ]
-    return float(np.mean(found)) if found else None
 
 
 def image_renderer(splats: Splats, backend: str) -> ImageRenderer:

@@ -52,12 +52,10 @@ def ssim(image: NDArray[np.floating], truth: NDArray[np.floating], valid: Valid 
         return np.asarray(cv2.sepFilter2D(x, -1, weights, weights, borderType=cv2.BORDER_CONSTANT))
 
     mean_a, mean_b = blur(a), blur(b)
-    var_a = blur(a * a) - mean_a * mean_a
-    var_b = blur(b * b) - mean_b * mean_b
-    cov = blur(a * b) - mean_a * mean_b
+    means, squares = mean_a * mean_b, mean_a * mean_a + mean_b * mean_b
+    covariance, variances = blur(a * b) - means, blur(a * a + b * b) - squares
     c1, c2 = 0.01**2, 0.03**2
-    score = (2 * mean_a * mean_b + c1) * (2 * cov + c2)
-    score /= (mean_a * mean_a + mean_b * mean_b + c1) * (var_a + var_b + c2)
+    score = (2 * means + c1) * (2 * covariance + c2) / ((squares + c1) * (variances + c2))
     return _mean(score, valid)
 
 

@@ -19,6 +19,7 @@ from stages.base.errors import ReconstructionError, SplatError
 from stages.base.stage import Report
 from stages.evaluate.evaluation import (
     EvaluationView,
+    evaluation_subset,
     load_evaluation_views,
     mean_psnr_db,
     psnr_of_views_db,
@@ -57,13 +58,14 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     reconstruction = reconstruction.with_masks(trained.masks)
     splats, backend = trained.splats, settings.backend
     _check_one_splat(settings, splats, reconstruction)
-    training, held_out = (
+    chosen, held_out = split_held_out(reconstruction.views)
+    training, evaluated = (
         load_evaluation_views(
             reconstruction.folder, views, splats.draw_settings, report.stop_requested
         )
-        for views in split_held_out(reconstruction.views)
+        for views in (chosen, [held_out[i] for i in evaluation_subset(len(held_out))])
     )
-    evaluated = held_out or training
+    evaluated = evaluated or training
     before_db = psnr_of_views_db(splats, evaluated, backend)
     pruner = pruner_of(settings, reconstruction, trained, training, backend, report, deadline)
     found = pruner.prune(splats)

@@ -28,6 +28,7 @@ from stages.base.stage import Report
 from stages.evaluate.evaluation import (
     SIZES,
     EvaluationView,
+    evaluation_subset,
     load_evaluation_views,
     mean_psnr_db,
     psnr_name,
@@ -240,7 +241,8 @@ def _measures(
             hint="Run `splat sfm` again.",
         )
     deciding = tuple(evenly_spaced(training, DECIDING_VIEWS))
-    evaluated, what = (held_out, "held out") if held_out else (deciding, "training")
+    subset = [held_out[i] for i in evaluation_subset(len(held_out))]
+    evaluated, what = (subset, "held out") if subset else (deciding, "training")
     folder, backend = reconstruction.folder, settings.backend
     decider, evaluator = (
         load_evaluation_views(folder, views, draw_settings, report.stop_requested)

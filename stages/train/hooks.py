@@ -33,7 +33,7 @@ from stages.train.trainer import Trainer
 from stages.train.transients import Comparison, transient_parts
 
 CHECKPOINT_SECONDS = 30.0
-EVALUATIONS = 10  # evenly spaced over the run
+EVALUATIONS, EVALUATED = 10, 12  # evenly spaced over the run; held-out views in each, at most
 FLOATER_REMOVALS = 20  # during a run, evenly spaced
 
 
@@ -49,8 +49,8 @@ def step_hooks(trainer: Trainer, start: Splats) -> list[StepHook]:
     task = trainer.task
     adaptive = AdaptiveDensity(len(task.views))
     density: DensityRule = BoundedDensity(adaptive, task.within) if task.within else adaptive
-    # Of very many held-out views a part is evaluated, so that it takes less time than training.
-    views = [task.held_out[i] for i in evaluation_subset(len(task.held_out))]
+    # Of many held-out views a part is evaluated, so that it takes less time than training.
+    views = [task.held_out[i] for i in evaluation_subset(len(task.held_out), EVALUATED)]
     time_limit = TimeLimit(task.seconds, task.most_steps)
     # of the cameras before their refinement, which a resumed run has, too
     free_space = known_free_space(start.means, [v.levels[-1].camera for v in task.views])

@@ -19,7 +19,6 @@ from stages.evaluate.evaluation import (
     evaluation_subset,
     load_evaluation_views,
     psnr_as_taken_db,
-    psnr_inside_masks_db,
     psnr_name,
 )
 from stages.evaluate.verdict import Verdict, fits, verdict
@@ -60,9 +59,8 @@ def write_quality(
         unadapted, adapted = psnr_as_taken_db(render, reconstruction.folder, held, draw_settings)
         report.metric("psnr_as_taken_db", round(unadapted, 3))
         report.metric("psnr_adapted_db", round(adapted, 3))
-    inside = psnr_inside_masks_db(render, views)
-    if inside is not None:
-        report.metric("psnr_inside_db", round(inside, 3))
+    if inside := [score.inside_db for score in scores if score.inside_db is not None]:
+        report.metric("psnr_inside_db", round(float(np.mean(inside)), 3))
     figures = [
         {psnr_name(name): score.psnr_db for name, score in zip(by_size, same, strict=True)}
         for same in zip(*by_size.values(), strict=True)

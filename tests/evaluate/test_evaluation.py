@@ -130,7 +130,7 @@ def test_an_evaluation_at_sizes_draws_each_size_and_begins_with_the_full_one(
     assert list(found) == ["full", "half", "quarter"]
     assert found["full"] == evaluate(draw, views, with_flip=True)
     for name, scale in (("half", 0.5), ("quarter", 0.25)):
-        assert found[name] == evaluate(draw, [view.scaled(scale) for view in views], with_flip=True)
+        assert found[name] == evaluate(draw, [view.scaled(scale) for view in views])
 
 
 def test_a_python_without_flip_evaluates_without_it(
