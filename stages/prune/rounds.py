@@ -29,6 +29,7 @@ from stages.scene import Splats, evenly_spaced
 from stages.train.finetune import FineTuner
 
 SMALLEST_SHARE = ROUND_SHARE / 8  # of the splats, that a round removes
+REFUSALS = 3  # of rounds that are measured
 # A round that costs too much, or is predicted to, is tried again with fewer splats: as many as cost
 # AIM of what is allowed, if the loss grows with this power of their number.
 AIM, POWER = 0.95, 1.6
@@ -172,6 +173,8 @@ class Pruner:
                 best_db = max(best_db, after.psnr_db, key=np.mean)
                 continue
             share, found.stopped_by = self._smaller(share, after.psnr_db, state, best_db), LOSS
+            if sum(not one.kept for one in found.rounds) == REFUSALS:
+                break
         found.end_db = float(state.psnr_db.mean())
         self.targets.check_end(found.splats, found.end_db)
         return found

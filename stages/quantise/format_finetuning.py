@@ -22,6 +22,8 @@ from stages.raster.compensation import without_compensation
 from stages.scene import QuantisedSplats, Reconstruction, Splats, split_held_out, training_extent
 from stages.train.finetune import FineTuner
 
+PLAIN_RATES = 3.0, 0.4  # with them 200 steps are as good as 300 with the usual ones
+
 
 @dataclass(frozen=True)
 class FormatFinetuning:
@@ -74,7 +76,7 @@ class FormatFinetuning:
             view_counts = measure_contributions(splats, views, backend).view_counts
         extent = training_extent(reconstruction)
         rounding = FineTuner(views, extent, backend, report, dropout)
-        plain = FineTuner(views, extent, backend, report, dropout, half_size=True)
+        plain = FineTuner(views, extent, backend, report, dropout, True, PLAIN_RATES)
         return cls(rounding, plain, deciding_views, view_counts, settings, report)
 
     def to_plain_drawing(self, splats: Splats, earlier: Splats | None = None) -> Splats | None:

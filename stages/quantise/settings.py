@@ -41,7 +41,7 @@ class QuantiseSettings:
     )
     drawing: str = drawing_setting()
     plain_steps: int = setting(
-        300,
+        200,
         "Steps of fine-tuning of antialiased splats for formats that are drawn plainly.",
         min=0,
         max=100_000,

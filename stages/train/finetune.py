@@ -29,7 +29,7 @@ from stages.train.steps.step import StepInput, step_of
 from stages.train.views import Level
 
 # Factors of the default learning rates: at the first step of a call, and at its last.
-RATE, RATE_END = 1.2, 0.6
+RATES = 1.2, 0.6
 MEANS_LR, MEANS_LR_END = 6e-5, 3e-5  # x scene extent
 _SH_COLUMNS = {"sh_dc": slice(0, 1), "sh_rest": slice(1, None)}
 
@@ -44,6 +44,7 @@ class FineTuner:
         report: says before each step whether to stop.
         dropout: whether to use dropout, and to refit colours afterwards, as training did.
         half_size: whether every second step uses its view at half the size.
+        rates: as `RATES`.
     """
 
     def __init__(
@@ -54,9 +55,10 @@ class FineTuner:
         report: Report,
         dropout: bool = False,
         half_size: bool = False,
+        rates: tuple[float, float] = RATES,
     ) -> None:
         self.views, self.extent, self.report, self.dropout = views, extent, report, dropout
-        self.half_size, self.cameras = half_size, [view.camera for view in views]
+        self.half_size, self.rates, self.cameras = half_size, rates, [view.camera for view in views]
         self.steps = 0  # done in all calls; the order of views and dropout depend on it
         # By view and size: steps tell views apart by these objects.
         self._means: dict[tuple[int, bool], NDArray[np.float32]] = {}
@@ -92,7 +94,7 @@ class FineTuner:
             done = number / steps
             rates = LearningRates().scaled(
                 MEANS_LR * self.extent * (MEANS_LR_END / MEANS_LR) ** done,
-                RATE * (RATE_END / RATE) ** done,
+                self.rates[0] * (self.rates[1] / self.rates[0]) ** done,
                 self.extent,
             )
             rates = replace(rates, **dict.fromkeys(frozen, 0.0))
