@@ -29,11 +29,10 @@ from stages.scene import Splats, evenly_spaced
 from stages.train.finetune import FineTuner
 
 SMALLEST_SHARE = ROUND_SHARE / 8  # of the splats, that a round removes
-REFUSALS = 3  # of rounds that are measured
 # A round that costs too much, or is predicted to, is tried again with fewer splats: as many as cost
 # AIM of what is allowed, if the loss grows with this power of their number.
 AIM, POWER = 0.95, 1.6
-PESSIMISM = 1.15  # x the predicted loss: splats that go together miss each other
+PESSIMISM = 1.15  # x the predicted loss, before a round was refused: neighbours miss each other
 TINY = float(np.finfo(np.float64).tiny)
 # why pruning stopped
 RATE_DISTORTION, LOSS, ROUNDS, TIME = "rate_distortion", "loss", "rounds", "time"
@@ -129,7 +128,7 @@ class Pruner:
     deadline: float = math.inf
 
     def __post_init__(self) -> None:
-        every = range(len(self.views))
+        every, self._pessimism = range(len(self.views)), PESSIMISM
         self._measured = evenly_spaced(every, MAX_MEASURED_VIEWS)
         self._others = sorted(set(every) - set(self._measured))
         # in the order of `Contributions.scene_depth`
@@ -172,9 +171,12 @@ class Pruner:
                 # what fine-tuning gains is not added to the loss allowed
                 best_db = max(best_db, after.psnr_db, key=np.mean)
                 continue
+            predicted, used = (
+                self.targets.used(best_db - db)
+                for db in (self._predicted_db(state, removal), after.psnr_db)
+            )
+            self._pessimism *= max(1.0, used / max(predicted, TINY))
             share, found.stopped_by = self._smaller(share, after.psnr_db, state, best_db), LOSS
-            if sum(not one.kept for one in found.rounds) == REFUSALS:
-                break
         found.end_db = float(state.psnr_db.mean())
         self.targets.check_end(found.splats, found.end_db)
         return found
@@ -251,12 +253,15 @@ class Pruner:
             removal = self._select(found, state, excess, share)
             if removal is None or excess > 0 or self.targets.min_psnr_db:
                 return removal, share
-            ratio = 1 + removal.predicted_sse / max(state.sse, TINY)
-            predicted_db = state.psnr_db - PESSIMISM * 10 * math.log10(max(ratio, TINY))
+            predicted_db = self._predicted_db(state, removal)
             if self.targets.allows(predicted_db, best_db):
                 return removal, share
             share = self._smaller(share, predicted_db, state, best_db)
         return None, share
+
+    def _predicted_db(self, state: Contributions, removal: Removal) -> Psnr:
+        ratio = 1 + removal.predicted_sse / max(state.sse, TINY)
+        return state.psnr_db - self._pessimism * 10 * math.log10(max(ratio, TINY))
 
     def _smaller(self, share: float, psnr_db: Psnr, state: Contributions, best_db: Psnr) -> float:
         """The share of the splats to try after one that leads from `state` to `psnr_db`."""

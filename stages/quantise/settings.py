@@ -63,7 +63,7 @@ class QuantiseSettings:
 
 STAGE = Stage(
     "quantise",
-    version=15,
+    version=16,
     reads=("sfm", "train", "prune"),
     settings_type=QuantiseSettings,
     adds="formats",

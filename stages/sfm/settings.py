@@ -99,7 +99,7 @@ class SfmSettings:
 
 STAGE = Stage(
     "sfm",
-    version=25,
+    version=26,
     reads=("ingest",),
     settings_type=SfmSettings,
     **in_module("stages.sfm.stage"),

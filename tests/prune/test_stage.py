@@ -224,6 +224,22 @@ def test_a_size_in_megabytes_is_met_from_below(scene, tmp_path) -> None:
     assert 0.95 * 16_000 < path.stat().st_size <= 16_000
 
 
+def test_a_round_that_is_predicted_to_cost_too_much_is_not_measured(
+    scene, tmp_path, monkeypatch
+) -> None:
+    measured = []
+    measure = contribution.measure_contributions
+
+    def counting(*args, **settings) -> Contributions:
+        measured.append(args)
+        return measure(*args, **settings)
+
+    monkeypatch.setattr(pruning, "measure_contributions", counting)
+    _, report = run(scene, scene.splats, tmp_path, max_loss_db=1e-6)
+    assert report.metrics["stopped_by"] == "loss"
+    assert len(measured) == 1  # before the first round
+
+
 def test_a_psnr_is_met_and_no_better_than_needed(scene, tmp_path) -> None:
     wanted = training_db(scene, scene.splats) - 3
     result, _ = run(scene, scene.splats, tmp_path, min_psnr=wanted, rounds=40)

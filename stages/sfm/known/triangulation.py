@@ -23,16 +23,15 @@ from stages.sfm.known.epipolar import (
 )
 from stages.sfm.worker.job import CameraGuess, KnownCameras, Neighbours, Project, Triangulation
 from stages.sfm.worker.mapping import point_arrays
-from stages.sfm.worker.matching import Pixels, match_pairs
+from stages.sfm.worker.matching import FEWEST_INLIERS, Pixels, match_pairs
 from stages.sfm.worker.pair_checks import verified_matches
 from stages.sfm.worker.pairs import Pair
 from stages.sfm.worker.sparse_model import camera_centres
 
+ROUGH = 4.0  # x the distance of inliers, for rough poses
+FITTING = 0.5  # of the matches of a pair must fit the poses to be believed; by chance 1 % do
 # Factor on COLMAP's error thresholds of triangulation, for each round of refinement: with the usual
 # thresholds, rough poses give no points to begin with.
-ROUGH = 4.0  # x the distance of inliers, for rough poses
-# Share of the matches of a pair that must fit the poses to be believed; by chance 1 % do.
-FITTING = 0.5
 REFINEMENTS = (8.0, 4.0, 2.0, 1.0, 1.0)
 
 
@@ -56,7 +55,8 @@ def _posed_geometry(
     """The matches that lie roughly where the poses predict them, if enough lie there exactly; else
     None. RANSAC finds the same in twenty times the time."""
     distances = epipolar_distances((*pair, first, second), known.intrinsics, known.world_to_camera)
-    if distances is None or np.mean(distances < INLIER_DISTANCE * side) < FITTING:
+    fewest = max(FEWEST_INLIERS, FITTING * len(matches))
+    if distances is None or np.sum(distances < INLIER_DISTANCE * side) < fewest:
         return None
     geometry = pycolmap.TwoViewGeometry()
     geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED

@@ -160,10 +160,8 @@ class _Matcher:
         """(matches, two-view geometry; without inliers if it has too few)."""
         matches = match_descriptors(*map(self.features.index, pair))
         sides = [(self._cameras[position], self.features.points(position)) for position in pair]
-        known = None
-        if self._known and len(matches) >= FEWEST_INLIERS:
-            matched = (points[matches[:, k]] for k, (_, points) in enumerate(sides))
-            known = self._known(pair, matches, *matched)
+        matched = (points[rows] for (_, points), rows in zip(sides, matches.T, strict=True))
+        known = self._known and self._known(pair, matches, *matched)
         return matches, known or two_view_geometry(sides[0], sides[1], matches, self._project.seed)
 
 

@@ -6,6 +6,8 @@ import numpy as np
 
 from stages.scene import look_at
 from stages.sfm.known.epipolar import median_inlier_ratio
+from stages.sfm.known.triangulation import _posed_geometry
+from stages.sfm.worker.job import KnownCameras
 
 LENS = np.array([500.0, 520.0, 310.0, 250.0])
 RANDOM = np.random.default_rng(3)
@@ -45,3 +47,19 @@ def test_without_pairs_there_is_no_ratio() -> None:
     assert median_inlier_ratio([], np.tile(LENS, (8, 1)), POSES, 640.0) is None
     here = np.tile(POSES[:1], (8, 1, 1))
     assert median_inlier_ratio(PAIRS, np.tile(LENS, (8, 1)), here, 640.0) is None
+
+
+def test_matches_that_fit_the_poses_need_no_estimate_and_wrong_poses_are_not_believed() -> None:
+    known = KnownCameras(np.tile(LENS, (8, 1)), POSES)
+    matches = np.arange(len(CLOUD), dtype=np.uint32).repeat(2).reshape(-1, 2)
+    first, second, a, b = PAIRS[0]
+    wrong = np.arange(len(CLOUD)) < 60
+    b = np.where(wrong[:, None], b[::-1], b)
+    geometry = _posed_geometry(known, 640.0, (first, second), matches, a, b)
+    assert geometry is not None
+    kept = np.isin(np.arange(len(CLOUD)), geometry.inlier_matches[:, 0])
+    assert kept[~wrong].all()
+    assert kept[wrong].mean() < 0.3
+    assert _posed_geometry(known, 640.0, (first, 7), matches, a, b) is None
+    few = _posed_geometry(known, 640.0, (first, second), matches[:9], a[-9:], b[-9:])
+    assert few is None
