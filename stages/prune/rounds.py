@@ -29,8 +29,8 @@ from stages.scene import Splats, evenly_spaced
 from stages.train.finetune import FineTuner
 
 SMALLEST_SHARE = ROUND_SHARE / 8  # of the splats, that a round removes
-# A round that costs too much, or is predicted to, is tried again with fewer splats: as many as cost
-# AIM of what is allowed, if the loss grows with this power of their number.
+# A round that is predicted to cost too much is planned again with fewer splats: as many as cost AIM
+# of what is allowed, if the loss grows with this power of their number.
 AIM, POWER = 0.95, 1.6
 PESSIMISM = 1.15  # x the predicted loss, before a round was refused: neighbours miss each other
 TINY = float(np.finfo(np.float64).tiny)
@@ -176,7 +176,7 @@ class Pruner:
                 for db in (self._predicted_db(state, removal), after.psnr_db)
             )
             self._pessimism *= max(1.0, used / max(predicted, TINY))
-            share, found.stopped_by = self._smaller(share, after.psnr_db, state, best_db), LOSS
+            share, found.stopped_by = share / 2, LOSS
         found.end_db = float(state.psnr_db.mean())
         self.targets.check_end(found.splats, found.end_db)
         return found
@@ -256,20 +256,14 @@ class Pruner:
             predicted_db = self._predicted_db(state, removal)
             if self.targets.allows(predicted_db, best_db):
                 return removal, share
-            share = self._smaller(share, predicted_db, state, best_db)
+            before, used = (self.targets.used(best_db - db) for db in (state.psnr_db, predicted_db))
+            left = AIM * max(0.0, 1.0 - before) / max(used - before, TINY)
+            share *= min(0.9, left ** (1 / POWER))
         return None, share
 
     def _predicted_db(self, state: Contributions, removal: Removal) -> Psnr:
         ratio = 1 + removal.predicted_sse / max(state.sse, TINY)
         return state.psnr_db - self._pessimism * 10 * math.log10(max(ratio, TINY))
-
-    def _smaller(self, share: float, psnr_db: Psnr, state: Contributions, best_db: Psnr) -> float:
-        """The share of the splats to try after one that leads from `state` to `psnr_db`."""
-        if self.targets.min_psnr_db:
-            return share / 2
-        before, used = (self.targets.used(best_db - db) for db in (state.psnr_db, psnr_db))
-        left = AIM * max(0.0, 1.0 - before) / max(used - before, TINY)
-        return float(share * min(0.9, left ** (1 / POWER)))
 
     def _select(
         self, found: PruningResult, state: Contributions, excess: int, share: float

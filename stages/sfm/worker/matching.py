@@ -51,8 +51,8 @@ def match_all(job: Matching) -> None:
 
 
 def match_pairs(project: Project, wanted: Sequence[Pair], known: KnownGeometry) -> None:
-    """Match and verify the `wanted` pairs, except those that the database holds. known: is asked
-    before two-view geometry is estimated."""
+    """Match and verify the `wanted` pairs, except those that the database holds. known: gives their
+    two-view geometry where it is not to be estimated."""
     with _matcher(project, known) as matcher:
         matcher.run(wanted)
 
