@@ -38,7 +38,7 @@ class ExportSettings:
 
 STAGE = Stage(
     "export",
-    version=14,
+    version=15,
     reads=("sfm", "quantise"),
     settings_type=ExportSettings,
     adds="formats",

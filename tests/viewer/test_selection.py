@@ -6,6 +6,7 @@ import base64
 import shlex
 import threading
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,6 +25,8 @@ from tests.viewer.screenshots import SIZE
 
 CHAIN = "document.getElementById('chain').value"
 CHOSEN = "splatSelection.chosen.map(i => Array.from(splatSelection.centres.subarray(i, i + 3)))"
+
+CAMERA = "Array.from(splatSelection.app.root.findByName('camera').getWorldTransform().data)"
 
 
 def opened(browser: Browser, folder: Path) -> Path:
@@ -169,10 +172,9 @@ def test_looking_around_selects_nothing(browser: Browser, tmp_path: Path) -> Non
 
 
 def click(browser: Browser, x: float, y: float) -> None:
-    for kind in ("mousePressed", "mouseReleased"):
-        browser.call(
-            *("Input.dispatchMouseEvent",), type=kind, x=x, y=y, button="left", clickCount=1
-        )
+    for kind, buttons in (("mousePressed", 1), ("mouseReleased", 0)):
+        where: dict[str, Any] = {"x": x, "y": y, "button": "left", "buttons": buttons}
+        browser.call("Input.dispatchMouseEvent", type=kind, clickCount=1, **where)
 
 
 @pytest.mark.slow
@@ -198,13 +200,16 @@ def test_a_click_names_the_place_and_several_make_a_box(browser: Browser, tmp_pa
         browser.run(
             "(tool => { tool.value = 'points'; tool.onchange(); })(document.getElementById('tool'))"
         )
+        before = browser.run(CAMERA)
         places = [(0.0, 0.0, 4.0), (1.0, -0.5, 4.1), (0.5, 1.2, 4.05)]
         for place in places:
             (pixel,), _ = camera.project(np.array([place]))
             click(browser, *pixel.tolist())
-        browser.run("new Promise(done => setTimeout(done, 300))")
+            browser.run("new Promise(done => setTimeout(done, 1500))")  # a camera would turn
         shown = browser.run("document.getElementById('chosen').textContent")
+        turned = browser.run(f"{CAMERA}.map((v, i) => Math.abs(v - {before}[i]))")
         server.shutdown()
+    assert max(turned) < 1e-6
     assert shown.startswith("0.5,1.2,4.05: ")
     found = [tuple(map(float, query["at"].split(","))) for query in queries]
     np.testing.assert_allclose(found, places, atol=1e-3)

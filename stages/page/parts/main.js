@@ -80,6 +80,15 @@ function frameBy(act) {
     for (const button of document.querySelectorAll(".sse-frame")) button.addEventListener("click", instead, true);
 }
 
+// While points are named, a click does not turn the camera to what it hits, as it does in orbit mode.
+function holdWhileNaming(events) {
+    const { fire } = events;
+    events.fire = function (name, ...rest) {
+        const turns = name === "pick" || name === "orbitTarget:set";
+        return turns && find("tool").value === "points" ? this : fire.call(this, name, ...rest);
+    };
+}
+
 async function checkGraphics() {
     const context = document.createElement("canvas").getContext("webgl2");
     if (context) {
@@ -130,7 +139,10 @@ async function start() {
     };
     if (withPanel) panel = new Panel(scene, show);
     else shareKeys();
-    if (withPanel) window.splatSelection = new Selection(scene, app, source);
+    if (withPanel) {
+        window.splatSelection = new Selection(scene, app, source);
+        holdWhileNaming(viewer.events);
+    }
     if (!bare) makeAccessible(scene, app.graphicsDevice.canvas);
     app.on("prerender", () => panel && panel.frames++);
     const named = (name) => scene.shots.find((shot) => shot.name === name);
