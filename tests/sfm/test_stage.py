@@ -275,6 +275,16 @@ def test_halves_joined_by_one_weak_pair_end_in_an_error_in_every_configuration(
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("make", [bad_captures.sky, bad_captures.crowd])
+def test_nothing_but_sky_or_people_is_refused(
+    make: Callable[[Path], Capture], tmp_path: Path
+) -> None:
+    error = failure(make(tmp_path / "in"), tmp_path, max_features=1500)
+    assert error.family is Family.RECONSTRUCTION
+
+
+@pytest.mark.slow
 def test_turning_on_the_spot_has_no_parallax(tmp_path: Path) -> None:
     capture = bad_captures.turning_on_the_spot(tmp_path / "in", 6)
     assert failure(capture, tmp_path, max_features=1500).code == "sfm-no-parallax"

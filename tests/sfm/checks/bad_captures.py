@@ -72,6 +72,35 @@ def blank(folder: Path, count: int = 6) -> Capture:
     )
 
 
+def sky(folder: Path, count: int = 8) -> Capture:
+    """Two layers of clouds that drift."""
+    random = np.random.default_rng(0)
+    grains = (random.normal(0, 1, (12, 16)), random.normal(0, 1, (24, 32)))
+    layers = [cv2.resize(grain, (640, 480), interpolation=cv2.INTER_CUBIC) for grain in grains]
+    images = {}
+    for i in range(count):
+        far, near = (layer[5 * i :, 9 * k * i :][:300, :400] for k, layer in enumerate(layers, 1))
+        clouds = 160 + 30 * far + 15 * near + random.normal(0, 1.5, far.shape)
+        images[f"{i}.png"] = np.clip(clouds[..., None] + (60, 20, 0), 0, 255).astype(np.uint8)
+    return capture_of(folder, images)
+
+
+def crowd(folder: Path, count: int = 10) -> Capture:
+    """Pieces of a photograph in place of people, each of which goes its own way."""
+    random = np.random.default_rng(0)
+    scene = pictures(1)[0]
+    places, steps = random.uniform(0, 1, (14, 2)), random.uniform(-0.06, 0.06, (14, 2))
+    images = {}
+    for i in range(count):
+        picture = np.full((300, 400, 3), 190, np.uint8)
+        for k, (x, y) in enumerate((places + i * steps) % 1):
+            left, top = int(350 * x), int(180 * y)
+            piece = scene[20 * k : 20 * k + 120, 40 * k : 40 * k + 50]
+            picture[top : top + len(piece), left : left + piece.shape[1]] = piece
+        images[f"{i}.png"] = picture
+    return capture_of(folder, images)
+
+
 def date_stamp(folder: Path, count: int = 12) -> Capture:
     """Small steps around a scene, with the same large date in every picture."""
     images = {}
