@@ -108,7 +108,8 @@ def _attempted(name: str, value: Callable[[], str], needed: bool = True) -> Chec
     try:
         return Check(name, value())
     except Exception as error:
-        return Check(name, reason_of(error), ok=not needed)
+        reason = reason_of(error)
+        return Check(name, reason if needed else f"none ({reason})", ok=not needed)
 
 
 def _kernel_cache() -> str:

@@ -99,9 +99,10 @@ def _cause(poor: Sequence[Fit], training: Sequence[Fit]) -> str:
     """Why views are poor, and what to do."""
     if training and float(np.mean([fit.explained < POOR for fit in training])) > FEW:
         return (
-            "Photographs that it was trained on are not reproduced either, so photographs "
-            "contradict each other: something moved, the light changed, or cameras are in wrong "
-            "places. Photograph a scene that stands still, in steady light, with more overlap."
+            "Photographs that it was trained on are not reproduced either: unless training was "
+            "very short, they contradict each other. Something moved, the light changed, or "
+            "cameras are in wrong places. Photograph a scene that stands still, in steady light, "
+            "with more overlap."
         )
     if poor and float(np.mean([fit.behind for fit in poor])) > MOSTLY:
         return (
