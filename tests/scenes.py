@@ -137,7 +137,7 @@ def exact_gradients(scene, view, v_image, settings=None, smoothing=None):
     """As `gradients`, in float64 by autograd through the definition: what backends are held to."""
     import torch
 
-    from tests.reference.definition import parameters_of, render_tensors
+    from stages.raster.reference import parameters_of, render_tensors
 
     p = parameters_of(scene)
     widths = None if smoothing is None else torch.tensor(smoothing, dtype=torch.float64)

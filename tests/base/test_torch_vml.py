@@ -12,7 +12,7 @@ PROCESSES = 16  # without the warm-up, one in four showed the difference on two 
 
 FIRST_AND_SECOND = """
 import torch
-import tests.reference.definition
+import stages.raster.reference
 
 values = torch.linspace(-8, -2, 30_000, dtype=torch.float64)
 positive = -values

@@ -10,9 +10,9 @@ import torch
 
 from stages.editing.transform import Similarity, rotation_about, rotation_to_up
 from stages.raster.definition import RasterSettings
+from stages.raster.reference import parameters_of, render_tensors
 from stages.scene import DrawSettings, Splats
 from tests import scenes
-from tests.reference.definition import parameters_of, render_tensors
 
 TURN = rotation_about(np.array([0.3, -1.0, 0.5]), 77.0)
 SETTINGS = RasterSettings(near=0.1)

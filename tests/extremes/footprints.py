@@ -9,11 +9,11 @@ import torch
 
 from stages.raster.definition import RasterSettings
 from stages.raster.draw import render
+from stages.raster.reference import parameters_of, project, render_tensors, rotation_matrices
 from tests.extremes import gpu, kernels
 from tests.extremes.measured import Measured, broken, broken_gradients, difference, worst
 from tests.extremes.oracles import finite_differences
 from tests.extremes.sixty_digits import exact_gradients
-from tests.reference.definition import parameters_of, project, render_tensors, rotation_matrices
 from tests.scenes import PARAMETERS, camera, cloud, gradients, relative, splats, textbook_alpha
 from tests.tolerances import (
     CLAMP_GRADIENT,

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from stages.raster.definition import TRANSMITTANCE_MIN, RasterSettings
+from stages.raster.reference import Parameters, parameters_of, render_tensors
 from stages.scene import dc_to_rgb
-from tests.reference.definition import Parameters, parameters_of, render_tensors
 from tests.scenes import PARAMETERS, textbook_alpha
 
 L = np.longdouble

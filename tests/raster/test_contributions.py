@@ -18,7 +18,7 @@ from stages.raster.definition import (
     RasterSettings,
     splat_arrays,
 )
-from tests.reference.definition import blend_weights, parameters_of, project, render_tensors
+from stages.raster.reference import blend_weights, parameters_of, project, render_tensors
 from tests.scenes import BACKENDS, LIGHT_BACKENDS, camera, cloud, relative, splats
 
 SETTINGS = RasterSettings(background=(0.2, 0.5, 0.9), sh_degree=2)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from stages.raster import reference
 from stages.raster.definition import RasterSettings, splat_arrays
-from tests.reference import definition as reference
 from tests.reference.rasteriser import ReferenceRasteriser
 from tests.scenes import PARAMETERS, camera, cloud, exact_gradients, gradients, relative
 from tests.tolerances import FLOAT32_OUTPUT

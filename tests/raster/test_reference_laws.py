@@ -8,8 +8,8 @@ import torch
 
 from stages.raster.definition import RasterSettings
 from stages.raster.draw import render
+from stages.raster.reference import Parameters, parameters_of, render_tensors
 from stages.scene import Camera, Splats
-from tests.reference.definition import Parameters, parameters_of, render_tensors
 from tests.scenes import BACKENDS, LIGHT_BACKENDS, PARAMETERS, camera, cloud, join, splats
 from tests.tolerances import FINITE_DIFFERENCE, FLOAT32_SHIFT
 

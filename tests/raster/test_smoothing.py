@@ -72,7 +72,7 @@ def test_every_gradient_through_the_filter_agrees(antialias):
 def test_the_definition_of_the_filter_has_the_gradient_of_its_finite_differences():
     import torch
 
-    from tests.reference.definition import Parameters, apply_smoothing, parameters_of
+    from stages.raster.reference import Parameters, apply_smoothing, parameters_of
 
     p = parameters_of(cloud(20))
     widths = torch.tensor(widths_for(cloud(20)), dtype=torch.float64)

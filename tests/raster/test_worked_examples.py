@@ -13,10 +13,10 @@ from stages.raster.cpu.projection import (
 from stages.raster.cpu.rasteriser import CpuRasteriser
 from stages.raster.definition import RasterSettings, splat_arrays
 from stages.raster.draw import render
+from stages.raster.reference import parameters_of, project, sh_basis
 from stages.scene import Camera
 from tests.raster.kernel_values import footprint_values
 from tests.raster.kernel_values import sh_basis_values as kernel_basis
-from tests.reference.definition import parameters_of, project, sh_basis
 from tests.scenes import BACKENDS, LIGHT_BACKENDS, camera, splats
 from tests.tolerances import WORKED
 

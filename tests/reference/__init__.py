@@ -1,5 +1,4 @@
-"""What backends are held to: the definition of a picture (`definition`), as a backend of its own
-(`rasteriser`, 300 times slower than the CPU's) and as a training step (`step`).
+"""The definition as a backend for tests: 300 times slower than the CPU's.
 
 Importing this package adds it to the lists of backends and of training steps.
 """

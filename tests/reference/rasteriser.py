@@ -25,8 +25,7 @@ from stages.raster.definition import (
     gradient_columns,
     with_smoothing,
 )
-from stages.scene import Camera
-from tests.reference.definition import (
+from stages.raster.reference import (
     Parameters,
     Projected,
     alphas_at,
@@ -38,6 +37,7 @@ from tests.reference.definition import (
     render_projected,
     weights_of,
 )
+from stages.scene import Camera
 
 _LARGEST = float(np.finfo(np.float32).max)
 

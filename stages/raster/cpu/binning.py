@@ -95,7 +95,7 @@ def _order_ties(
     visible: NDArray[np.int32],
     arrays: Arrays,
 ) -> None:
-    """Put runs of equal `depths` [V], which are sorted, into the order that the reference defines:
+    """Put runs of equal `depths` [V], which are sorted, into the order that `reference` defines:
     by the splats' own values. Few splats are left to compare after their means."""
     means, quaternions, log_scales, opacity_logits, sh = arrays
     tied = np.flatnonzero(_in_runs(depths[1:] == depths[:-1]))

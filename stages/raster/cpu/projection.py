@@ -1,7 +1,7 @@
 """Projection of splats to footprints, and its backward pass to their parameters, eight at a time.
 
 Everything is in float64, which costs little beside blending and avoids overflow, cancellation in
-the determinant, and loss of precision for distant means. Formulas as in the reference.
+the determinant, and loss of precision for distant means. Formulas as in `reference`.
 """
 
 from __future__ import annotations

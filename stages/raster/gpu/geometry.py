@@ -1,6 +1,6 @@
 """Footprints of splats: what the forward and the backward pass both compute.
 
-Formulas as in the reference, one splat in each lane. REAL is the type of all numbers: float64, or
+Formulas as in `reference`, one splat in each lane. REAL is the type of all numbers: float64, or
 float32 in a test that measures what it costs. A row of parameters has the columns of a row of
 gradients (`definition`).
 """
@@ -55,7 +55,7 @@ def is_finite(x):
 
 @inner
 def drawable(rows, at, mask, smoothing, i, used, SMOOTH: tl.constexpr):
-    """Whether a row can be drawn at all: see the reference. Its `used` columns are float32;
+    """Whether a row can be drawn at all: see `reference.drawable`. Its `used` columns are float32;
     GROUP neighbours are read at once, by neighbouring lanes."""
     wrong, k = (at * 0).to(tl.int32), tl.expand_dims(tl.arange(0, GROUP), 0)
     here, some = tl.expand_dims(rows + at, 1), tl.expand_dims(mask, 1)

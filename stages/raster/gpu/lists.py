@@ -146,7 +146,7 @@ def compared(rows, a, b, mask, k, sign, columns):
 @inner
 def order_of(rows, a, b, mask, columns, used):
     """-1 where rows a come before rows b, 1 where after, 0 where equal: by mean, opacity,
-    scales, rotation and SH, as in the reference."""
+    scales, rotation and SH, as in `reference`."""
     sign = (a * 0).to(tl.int32)
     for k in tl.static_range(3):
         sign = compared(rows, a, b, mask, MEAN + k, sign, columns)
