@@ -168,10 +168,10 @@ def cameras() -> str:
 
 
 def backends() -> str:
-    from stages.raster.backends import BACKENDS, CHOICES
+    from stages.raster.backends import BACKENDS
 
     rows: list[tuple[str, ...]] = [("`auto`", "the fastest that runs here")]
-    rows += [(f"`{one.name}`", one.summary) for one in BACKENDS if one.name in CHOICES]
+    rows += [(f"`{backend.name}`", backend.summary) for backend in BACKENDS]
     return _table(("`--backend`", "is"), rows)
 
 

@@ -20,7 +20,6 @@ from stages.raster.definition import (
 )
 from stages.raster.draw import rendering_of
 from stages.scene import Camera, Splats, logit, rgb_to_dc
-from tests import reference  # noqa: F401 - adds its backend
 
 # Those that run everywhere. What they are held to, tests/raster/test_gpu.py holds the GPU's to.
 BACKENDS = tuple(backend.name for backend in backends.BACKENDS if not backend.needs_hardware)

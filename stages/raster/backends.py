@@ -1,7 +1,8 @@
 """The list of rendering backends, and the choice among them.
 
 To add a backend: write a class with the methods of `definition.Rasteriser` and add one row to
-`BACKENDS`, and its training step to `train.steps.step`.
+`BACKENDS`. A backend that also has training kernels gets a row in `train.steps.step`; the others
+train through `forward` and `backward`.
 """
 
 from __future__ import annotations
@@ -71,10 +72,18 @@ def _cpu() -> Rasteriser:
     return CpuRasteriser()
 
 
+def _reference() -> Rasteriser:
+    # loads torch, the list does not
+    from stages.raster.reference_rasteriser import ReferenceRasteriser
+
+    return ReferenceRasteriser()
+
+
 # "auto" takes the first that is available.
-BACKENDS: tuple[Backend, ...] = (
+BACKENDS = (
     Backend("gpu", _gpu, "Triton kernels", _why_no_gpu, _gpu_description, needs_hardware=True),
     Backend("cpu", _cpu, "compiled kernels"),
+    Backend("reference", _reference, "torch, slow"),
 )
 CHOICES = (AUTO, *(backend.name for backend in BACKENDS))
 

@@ -37,10 +37,10 @@ from stages.scene import Camera, Splats
 from stages.train.loss import channel_means
 from stages.train.optimiser import LearningRates, new_model
 from stages.train.steps.gpu import GpuStep
+from stages.train.steps.reference import reference_loss
 from stages.train.steps.step import StepInput
 from stages.train.views import Level
 from tests.benchmarks.scenes import random_scene, view
-from tests.reference.step import reference_loss
 from tests.scenes import PARAMETERS, camera, cloud, exact_gradients, gradients, relative
 from tests.tolerances import FLOAT32_GRADIENT, FLOAT32_IMAGE
 

@@ -24,7 +24,6 @@ from stages.train.loss import channel_means
 from stages.train.optimiser import Model, new_model
 from stages.train.schedule import SCALES, Schedule
 from stages.train.views import Level, TrainingView
-from tests import reference  # noqa: F401 - adds its backend
 from tests.benchmarks.gate import check_kernels
 from tests.benchmarks.scenes import PICTURES, random_scene, trained_scene, view
 from tests.benchmarks.timing import (

@@ -8,7 +8,7 @@ import pytest
 from stages.raster import backends
 from stages.raster.backends import Backend
 from stages.raster.definition import Backward
-from tests.reference.rasteriser import ReferenceRasteriser
+from stages.raster.reference_rasteriser import ReferenceRasteriser
 from tests.scenes import BACKENDS, camera, cloud, exact_gradients, gradients, relative
 from tests.tolerances import FLOAT32_GRADIENT
 
@@ -41,6 +41,16 @@ def test_a_backend_that_returns_zeros_is_found_out(monkeypatch: pytest.MonkeyPat
     assert worst_gradient("zeros") > 0.5
 
 
+def test_a_backend_takes_part_in_training_without_a_step_of_its_own(monkeypatch) -> None:
+    from stages.raster.reference_rasteriser import ReferenceRasteriser
+    from stages.train.steps.reference import ReferenceStep
+    from stages.train.steps.step import step_of
+
+    fake = Backend("another", ReferenceRasteriser, "a test")
+    monkeypatch.setattr(backends, "BACKENDS", (*backends.BACKENDS, fake))
+    assert isinstance(step_of("another"), ReferenceStep)
+
+
 def test_an_unknown_backend_is_named_with_those_that_there_are() -> None:
-    with pytest.raises(ValueError, match=r"'magic', wanted one of auto, gpu, cpu$"):
+    with pytest.raises(ValueError, match=r"'magic', wanted one of auto, gpu, cpu, reference"):
         backends.rasteriser_of("magic")

@@ -31,12 +31,12 @@ from stages.raster.definition import RasterSettings, splat_arrays
 from stages.raster.draw import renderer
 from stages.raster.gpu import device, inner
 from stages.raster.gpu.rasteriser import GpuRasteriser
+from stages.raster.reference_rasteriser import ReferenceRasteriser
 from stages.run import results
 from stages.train.settings import TrainSettings
 from tests import processes
 from tests.extremes.gpu import on_gpu
 from tests.extremes.table import ROWS, measured
-from tests.reference.rasteriser import ReferenceRasteriser
 from tests.scenes import PARAMETERS, camera, cloud, exact_gradients, gradients, relative
 from tests.tolerances import FLOAT32_GRADIENT, FLOAT32_IMAGE
 

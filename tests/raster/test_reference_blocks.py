@@ -8,7 +8,7 @@ import torch
 
 from stages.raster import reference
 from stages.raster.definition import RasterSettings, splat_arrays
-from tests.reference.rasteriser import ReferenceRasteriser
+from stages.raster.reference_rasteriser import ReferenceRasteriser
 from tests.scenes import PARAMETERS, camera, cloud, exact_gradients, gradients, relative
 from tests.tolerances import FLOAT32_OUTPUT
 

@@ -23,7 +23,6 @@ from stages.train.camera_refinement import camera_gradients
 from stages.train.conversion import model_of
 from stages.train.settings import TrainSettings
 from stages.train.steps.step import step_of
-from tests import reference  # noqa: F401 - adds its backend
 from tests.small_scene import small_scene
 
 SETTINGS = RasterSettings(near=0.1, sh_degree=0)

@@ -23,9 +23,9 @@ from stages.train.optimiser import LearningRates, new_model
 from stages.train.schedule import DENSIFICATION_END, Schedule
 from stages.train.steps import gpu as gpu_step
 from stages.train.steps.cpu import CpuStep
+from stages.train.steps.reference import ReferenceStep
 from stages.train.steps.step import StepInput
 from stages.train.views import Level
-from tests.reference.step import ReferenceStep
 from tests.scenes import camera, cloud
 from tests.train.pictures import trainer_of, view_of
 

@@ -19,7 +19,7 @@ from stages.train.optimiser import (
     camera_distances,
     new_model,
 )
-from tests.reference.step import adam
+from stages.train.steps.reference import adam
 from tests.scenes import camera
 
 RATES = LearningRates(means=0.01)

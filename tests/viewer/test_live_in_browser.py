@@ -26,7 +26,7 @@ from stages.scene import Camera, Splats
 from stages.scene.framing import median_depth
 from stages.viewer.live_page import LivePage
 from stages.viewer.server import LocalServer
-from tests import processes, reference, sample  # noqa: F401 - adds its backend
+from tests import processes, sample
 from tests.tolerances import LIVE_PICTURE_DB
 from tests.viewer.browser import Browser
 from tests.viewer.screenshots import WORSE_DB, coloured_scene, views, wrong_versions

@@ -1,6 +1,6 @@
 """One training step by backend: forward pass, loss, backward pass and Adam.
 
-`step` is the interface and the choice. `cpu` and `gpu` are the steps, by `loss_kernels` and
-`gpu_kernels`; `tests/reference/step.py` is a readable one, from the definitions. `device_model` is
-what `gpu` gives to the rules between steps. `memory_limited` continues with fewer splats.
+`step` is the interface and the choice. `reference` is the readable step, `cpu` and `gpu` are the
+fast ones, by `loss_kernels` and `gpu_kernels`. `device_model` is what `gpu` gives to the rules
+between steps. `memory_limited` continues with fewer splats.
 """

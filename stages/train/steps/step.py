@@ -17,11 +17,12 @@ from stages.train.dropout import INVISIBLE, Dropout
 from stages.train.optimiser import LearningRates, Model, empty_model
 from stages.train.views import Level
 
-# By backend. A step keeps parameters and moments where its kernels are.
-STEPS = {
+# A backend with training kernels of its own keeps parameters and moments where these are.
+_OWN_STEPS = {
     "gpu": "stages.train.steps.gpu:GpuStep",
     "cpu": "stages.train.steps.cpu:CpuStep",
 }
+_OTHER_BACKENDS = "stages.train.steps.reference:ReferenceStep"
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ def step_of(backend: str) -> TrainingStep:
     """A new training step of the backend `backend` or "auto". Raises ValueError for an unknown
     name, SplatError if the hardware that it needs is absent."""
     chosen = backend_of(backend)
-    step_class = resolve_name(STEPS[chosen.name])
+    step_class = resolve_name(_OWN_STEPS.get(chosen.name, _OTHER_BACKENDS))
     step: TrainingStep = step_class(chosen.create())
     return step
 

@@ -15,16 +15,16 @@ pytest.importorskip("triton")
 from stages.raster.definition import MemoryFull, RasterSettings, splat_arrays
 from stages.raster.gpu import device
 from stages.raster.gpu.rasteriser import GpuRasteriser
+from stages.raster.reference_rasteriser import ReferenceRasteriser
 from stages.scene import IGNORE, TRANSPARENT
 from stages.train.dropout import Dropout
 from stages.train.loss import channel_means
 from stages.train.optimiser import LearningRates, Model, empty_model, new_model
 from stages.train.steps import gpu as gpu_step
 from stages.train.steps.gpu import GpuStep, image_loss
+from stages.train.steps.reference import ReferenceStep, reference_loss
 from stages.train.steps.step import StepInput
 from stages.train.views import Level
-from tests.reference.rasteriser import ReferenceRasteriser
-from tests.reference.step import ReferenceStep, reference_loss
 from tests.scenes import camera, cloud
 from tests.tolerances import LOSS_GRADIENT
 
