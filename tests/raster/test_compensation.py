@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from stages.raster.compensation import compensation, mean_compensation, without_compensation
-from stages.raster.draw import raster_settings_of, render
-from tests.reference.definition import parameters_of, project
+from stages.raster.compensation import mean_compensation, without_compensation
+from stages.raster.draw import render
 from tests.scenes import camera, cloud, splats
 from tests.tolerances import FLOAT32_IMAGE
 
@@ -24,19 +21,6 @@ def test_draw_settings_decide_how_splats_are_drawn():
     small = splats([[0, 0, 2.0]], scales=0.005, opacities=0.9)
     plain, compensated = render(small, camera()), render(small.with_antialias(True), camera())
     assert compensated.alpha.max() < 0.3 * plain.alpha.max()
-
-
-def test_the_factor_is_that_of_the_definition():
-    scene = cloud(200, size_px=0.7).with_antialias(True)
-    settings = raster_settings_of(scene)
-    plain, drawn = (
-        project(parameters_of(scene.with_antialias(on)), camera(), replace(settings, antialias=on))
-        for on in (False, True)
-    )
-    opacities = dict(zip(plain.index.tolist(), plain.opacities.tolist(), strict=True))
-    wanted = [o / opacities[i] for i, o in zip(drawn.index.tolist(), drawn.opacities, strict=True)]
-    found = compensation(scene.take(drawn.index.numpy()), camera(), settings.dilation_px2)
-    assert found == pytest.approx([float(one) for one in wanted], rel=1e-9)
 
 
 def test_seen_by_one_camera_the_picture_stays_the_same():
