@@ -8,7 +8,7 @@ from stages.scene import DrawSettings
 from stages.train.build import make_trainer
 from stages.train.conversion import model_of
 from stages.train.density import AdaptiveDensity, gradient_threshold
-from stages.train.hooks import step_hooks
+from stages.train.hooks import Densification, step_hooks
 from stages.train.optimiser import LearningRates
 from stages.train.schedule import RATE_DECAY_END, RATES_POWER, SCALES, Schedule
 from stages.train.settings import TrainSettings
@@ -113,7 +113,8 @@ def test_densification_takes_the_threshold_of_the_plan(tmp_path, monkeypatch):
         backend="cpu",
     )
     made.stepper.load(model_of(start))
-    densification = step_hooks(made, start)[1]
+    hooks = step_hooks(made, start)
+    densification = next(hook for hook in hooks if isinstance(hook, Densification))
     for steps in (7000, 28_000, 2000):
         made.schedule = made.schedule.replanned(50, steps)
         densify_at = next(s for s in range(51, steps) if made.schedule.densifies_after(s - 1))
