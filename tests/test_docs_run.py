@@ -67,6 +67,7 @@ def test_files_of_a_run_are_those_of_the_architecture_page(sample_run: Path) -> 
         "6-quantise/flat_dc.npy",
         "N-STAGE/manifest.json",
         "7-export/scene.*",
+        *(f"4-train/transients{ending}" for ending in ("", ".png", ".txt")),
     }:
         assert (sample_run / "run" / name).exists(), f"{name} is not in a run folder"
 
