@@ -129,14 +129,14 @@ def read(path: Path) -> Splats:
         return replace(ply.read(inside), first_camera=_first_camera(path))
 
 
-def _first_camera(path: Path) -> Camera:
-    """The first camera of a page. Raises what a damaged page causes."""
+def _first_camera(path: Path) -> Camera | None:
+    """The first camera of a page; None if it has none. Raises what a damaged page causes."""
     start, end = document.SCENE_START.encode("ascii"), document.CHUNK_END.encode("ascii")
     with path.open("rb") as page:
         while line := page.readline(_LINE_LIMIT_BYTES):
             if line.startswith(start) and line.endswith(end):
                 return camera_of(json.loads(line[len(start) : -len(end)])["shots"][0])
-    raise BadFileError("it holds no description of a scene")
+    return None
 
 
 def _unzipped(path: Path) -> Iterator[bytes]:
