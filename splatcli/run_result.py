@@ -25,7 +25,7 @@ _HEADLINES = {
     "export": ("files", "splats"),
 }
 _SMALLER = {"mean at half size": "psnr_half_db", "mean at quarter size": "psnr_quarter_db"}
-_SCALE = """To an eye: 20 dB is blurred, 25 dB is softer, 30 dB is hardly told apart.
+_SCALE = """To an eye: 20 dB is blurred, 25 dB is softer, 30 dB is close to the photograph.
 More of PSNR and SSIM: docs/guide/captures.md#psnr-and-ssim"""
 _STYLES = {GOOD: "green", USABLE: "yellow", WRONG: "red", UNKNOWN: ""}
 
