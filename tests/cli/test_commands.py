@@ -83,7 +83,7 @@ def test_warnings_are_repeated_at_the_end(splat) -> None:
 
 
 def test_asset_paths_are_not_broken_on_a_narrow_terminal(splat, monkeypatch) -> None:
-    monkeypatch.setattr(console.out, "width", 40)
+    monkeypatch.setattr(console.out, "_width", 40)  # undone by None, unlike the property
     long = "a folder with a name that is longer than any terminal is wide/run"
     result = splat("process", "photos", "--out", long)
     assert str(Path(long) / "7-export" / "out.ply") in result.stdout
@@ -355,7 +355,7 @@ def test_a_missing_run_folder_is_reported_with_the_first_command(splat) -> None:
         (["process", "photos", "--steps", "-4"], "--steps -4 cannot be used"),
         (["process", "photos", "--steps", "many"], "A whole number from 1 to 1,000,000."),
         (["process", "photos", "--preset", "fast"], "One of preview, standard, best."),
-        (["process", "photos", "--backend", "cuda"], "One of auto, gpu, cpu."),
+        (["process", "photos", "--backend", "cuda"], "One of auto, gpu, cpu, reference."),
         (["process", "photos", "--format", "obj"], "--format obj cannot be used"),
         (["process", "photos", "--stepz", "4"], "splat process: No such option: --stepz"),
         (["process", "photos", "--steps"], "--steps"),
