@@ -64,7 +64,6 @@ class Options(TypedDict, total=False):
     light: str
     refine_in_training: bool
     drawing: str
-    blocks: str
     within: tuple[float, ...]
     backend: str
     rounds: int

@@ -46,9 +46,8 @@ Cluster = Annotated[
     str | None,
     typer.Option(
         metavar="ADDRESS",
-        help="Ray cluster that executes runs, or the blocks of one run (HOST:PORT, "
-        "ray://HOST:PORT, auto), or local:N for N workers on this machine. It needs "
-        f"{_INSTALL_RAY}.",
+        help="Ray cluster that executes runs (HOST:PORT, ray://HOST:PORT, auto), or local:N for "
+        f"N workers on this machine. It needs {_INSTALL_RAY}.",
         show_default="this process",
         rich_help_panel="Advanced",
     ),

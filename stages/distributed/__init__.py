@@ -1,6 +1,5 @@
-"""Runs, and blocks of a scene, here or on a Ray cluster.
+"""Runs of many captures, here or on a Ray cluster.
 
-`tasks` has the executor that all use; `cluster` is the one on Ray, `remote` copies files for it.
-What is distributed: many captures (`batch`), and blocks of one scene (`blocks`, with `partition`,
-`block_folders` and `merge`).
+`batch` has their table, `tasks` the executor, `cluster` the one on Ray; `remote` copies files for
+it.
 """

@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import logging
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Event
 from typing import Any, Protocol
 
-from stages.base.errors import CRASHED, Family, Interrupted, SplatError
+from stages.base.errors import CRASHED, Interrupted, SplatError
 from stages.base.text import reason_of
 from stages.distributed.remote import Location, local_copies
 from stages.run.failures import as_splat_error
@@ -30,14 +29,12 @@ class RunTask:
     """`splat process PHOTOS --out RUN_FOLDER`.
 
     run_folder, photos: what is at a URL is copied to this machine first, see `remote.local_copies`.
-    photos: None to continue the run folder. settings: by stage name; stages that are left out use
-    the recorded ones. until: the last stage.
+    settings: by stage name; stages that are left out use the recorded ones.
     """
 
     run_folder: Location
-    photos: Location | None = None
+    photos: Location
     settings: Mapping[str, Any] = field(default_factory=dict)
-    until: str | None = None
 
     @property
     def folder(self) -> Path:
@@ -48,7 +45,7 @@ class RunTask:
         with local_copies(self.run_folder, self.photos) as (run_folder, photos, upload):
             listeners = Listeners(upload, listener or Listener())
             pipeline = Pipeline(run_folder, photos)
-            pipeline.run(self.settings, until=self.until, listener=listeners)
+            pipeline.run(self.settings, listener=listeners)
 
 
 def task_for(run_folder: Location, photos: Location, settings: Mapping[str, Any]) -> RunTask:
@@ -95,10 +92,6 @@ class Executor(Protocol):
         """
 
 
-OpenExecutor = Callable[[Path, Listener], AbstractContextManager[Executor]]
-"""open_executor(folder, listener): an executor for tasks in that folder."""
-
-
 def run_task(task: RunTask, listener: Listener | None = None) -> TaskResult:
     """Run a task in this process. A failure becomes a result; only Interrupted is raised."""
     try:
@@ -111,37 +104,6 @@ def run_task(task: RunTask, listener: Listener | None = None) -> TaskResult:
             return error_result(error)
         return error_result(as_splat_error(error, "the run", task.folder) or error)
     return TaskResult()
-
-
-def run_all(
-    executor: Executor,
-    tasks: Sequence[RunTask],
-    need: Resources,
-    stop: Event,
-    progress: Callable[[int], None],
-    hint: str,
-) -> None:
-    """Run all tasks.
-
-    Args:
-        progress: called with the number of tasks that have ended.
-        hint: of the error that is raised for the first failed task, after all others have ended.
-
-    Raises SplatError, and what `Executor.results` and `progress` raise.
-    """
-    failed = None
-    for done, (number, result) in enumerate(executor.results(tasks, need, stop), start=1):
-        progress(done)
-        if result.status and failed is None:
-            failed = SplatError(
-                result.code,
-                given=f"In {tasks[number].folder}: {result.message}",
-                wanted="All tasks finished.",
-                hint=hint,
-                family=Family(max(result.status, Family.USAGE)),
-            )
-    if failed is not None:
-        raise failed
 
 
 def error_result(error: BaseException) -> TaskResult:

@@ -84,18 +84,6 @@ def with_kills(folder: Path, command: Sequence[str], kills: int) -> int:
     return done
 
 
-def blocks_of(folder: Path, name: str, *more: str, kills: int = 0) -> dict[str, str]:
-    """Outputs of a capture in two blocks, from the cameras that were found before."""
-    for done in sorted((folder / "alone" / "front").glob("[1-3]-*")):
-        shutil.copytree(done, folder / name / done.name)
-    shutil.copy(folder / "alone" / "front" / "run.json", folder / name)
-    command = processes.splat(
-        "process", "captures/front", "--out", name, "--blocks", "2", *SMALL, *more
-    )
-    assert with_kills(folder, command, kills) == kills
-    return outputs(folder / name, "blocks/*/") | outputs(folder / name, "")
-
-
 def test_workers_that_are_killed_change_nothing(folder: Path) -> None:
     killed = with_kills(folder, words("killed", "--cluster", "local:2"), KILLS)
     assert killed == KILLS
@@ -126,12 +114,3 @@ def test_a_head_that_is_killed_leaves_nobody_behind_and_is_gone_on_with(folder: 
         time.sleep(0.2)
     subprocess.run(command, cwd=folder, check=True, timeout=600)
     assert outputs(folder / "headless") == outputs(folder / "alone")
-
-
-def test_blocks_are_the_same_whoever_trains_them(folder: Path) -> None:
-    here = blocks_of(folder, "here")
-    assert sum(name.startswith("blocks/") for name in here) > 10
-    for workers in (1, 2, 4):
-        address, kills = f"local:{workers}", int(workers == 2)
-        found = blocks_of(folder, f"by-{workers}", "--cluster", address, kills=kills)
-        assert found == here, workers
