@@ -9,12 +9,9 @@ from typing import Annotated
 import typer
 
 from splatcli.options import keyword, option
-from stages.base.distribution import install_command
 from stages.base.settings import Setting
 from stages.formats import FORMATS
 from stages.raster.backends import CHOICES
-
-_INSTALL_RAY = install_command("cluster").replace("[", r"\[")  # in rich markup
 
 ENDINGS = ", ".join(f".{ending}" for ending in FORMATS)
 
@@ -42,17 +39,6 @@ Out = Annotated[
 NoClobber = Annotated[
     bool, typer.Option("--no-clobber", help="Refuse to replace a file.", rich_help_panel="Output")
 ]
-Cluster = Annotated[
-    str | None,
-    typer.Option(
-        metavar="ADDRESS",
-        help="Ray cluster that executes runs (HOST:PORT, ray://HOST:PORT, auto), or local:N for "
-        f"N workers on this machine. It needs {_INSTALL_RAY}.",
-        show_default="this process",
-        rich_help_panel="Advanced",
-    ),
-]
-
 
 Backend = Annotated[
     str | None,

@@ -2,37 +2,33 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from splatcli import console, log, options, progress, run_settings
-from splatcli.arguments import Cluster
-from stages.distributed import remote
-from stages.distributed.batch import BatchTable, Row, check_output, run_names
-from stages.distributed.cluster import open_executor
-from stages.distributed.tasks import TaskResult, resources_of, task_for
+from stages.base.atomic import make_folder
+from stages.run.batch import BatchTable, Result, Row, run_capture, run_names
+from stages.run.lock import locked
+from stages.run.runfolder import check_outside
 
 
 def batch(
     captures: Annotated[
-        list[str],
-        typer.Argument(
-            help="Folders of photographs, or videos: one run for each. Also URLs that fsspec "
-            "knows, such as 's3://bucket/captures/*'."
-        ),
+        list[Path],
+        typer.Argument(help="Folders of photographs, or videos: one run for each."),
     ],
     *,
     out: Annotated[
-        str,
+        Path,
         typer.Option(
             "--out",
             "-o",
-            help="Folder, or URL, for the run folders and batch.csv.",
+            help="Folder for the run folders and batch.csv.",
             rich_help_panel="Output",
         ),
-    ] = "runs",
-    cluster: Cluster = None,
+    ] = Path("runs"),
     **given: Any,
 ) -> None:
     """Many captures: `splat process` for each, into a run folder of its name.
@@ -42,17 +38,15 @@ def batch(
     """
     settings = run_settings.of_new_run(options.given_only(given))
     log.write_settings(settings)
-    runs = remote.parse_location(out)
-    photos = run_names(remote.expand_locations(captures))
-    check_output(runs, [*photos.values()])
-    tasks = [task_for(remote.joined(runs, name), path, settings) for name, path in photos.items()]
+    runs = run_names(captures)
+    for photos in captures:
+        check_outside(out, photos)
     bars = progress.Bars() if console.mode.has_notes and console.err.is_terminal else None
-    with (
-        remote.prepare_output(runs) as local_folder,
-        open_executor(cluster, runs, photos.values(), bars) as executor,
-    ):
-        table = BatchTable(local_folder, runs, list(photos))
-        for number, result in executor.results(tasks, resources_of(settings["train"])):
+    make_folder(out)
+    with locked(out):
+        table = BatchTable(out, list(runs))
+        for number, (name, photos) in enumerate(runs.items()):
+            result = run_capture(out / name, photos, settings, bars)
             table.ended(number, result)
             _report(table.rows[number], result)
         table.write()
@@ -61,7 +55,7 @@ def batch(
         raise typer.Exit(table.worst_status)
 
 
-def _report(row: Row, result: TaskResult) -> None:
+def _report(row: Row, result: Result) -> None:
     """Print a line, or an event, for a run that ended."""
     if console.mode.as_json:
         console.emit("ended", **vars(row), exit_status=result.status, message=result.message)
@@ -75,7 +69,7 @@ def _report(row: Row, result: TaskResult) -> None:
 def _print(table: BatchTable) -> None:
     """The whole table, once all runs have ended."""
     if console.mode.as_json:
-        console.emit("result", folder=str(table.runs), rows=[vars(row) for row in table.rows])
+        console.emit("result", folder=str(table.folder), rows=[vars(row) for row in table.rows])
         return
     if not console.mode.quiet:
         console.table(
@@ -93,7 +87,7 @@ def _print(table: BatchTable) -> None:
                 for row in table.rows
             ],
         )
-    console.out.print(str(table.location), markup=False)
+    console.out.print(str(table.file), markup=False)
 
 
 def _db(row: Row) -> str:
