@@ -64,6 +64,7 @@ class Options(TypedDict, total=False):
     light: str
     refine_in_training: bool
     drawing: str
+    blocks: str
     within: tuple[float, ...]
     backend: str
     rounds: int

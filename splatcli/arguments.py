@@ -9,9 +9,12 @@ from typing import Annotated
 import typer
 
 from splatcli.options import keyword, option
+from stages.base.distribution import install_command
 from stages.base.settings import Setting
 from stages.formats import FORMATS
 from stages.raster.backends import CHOICES
+
+_INSTALL_RAY = install_command("cluster").replace("[", r"\[")  # in rich markup
 
 ENDINGS = ", ".join(f".{ending}" for ending in FORMATS)
 
@@ -39,6 +42,18 @@ Out = Annotated[
 NoClobber = Annotated[
     bool, typer.Option("--no-clobber", help="Refuse to replace a file.", rich_help_panel="Output")
 ]
+Cluster = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Ray cluster that executes runs, or the blocks of one run (HOST:PORT, "
+        "ray://HOST:PORT, auto), or local:N for N workers on this machine. It needs "
+        f"{_INSTALL_RAY}.",
+        show_default="this process",
+        rich_help_panel="Advanced",
+    ),
+]
+
 
 Backend = Annotated[
     str | None,

@@ -11,7 +11,6 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -100,14 +99,14 @@ def emit(event: str, **values: Any) -> None:
 def _refuse_urls(values: Mapping[str, Any]) -> None:
     """Raise SplatError (url-not-local) for a path that was typed as a URL; `Path` keeps one slash
     of two."""
-    every = (one if isinstance(one, list) else [one] for one in values.values())
-    for value in chain.from_iterable(every):
+    for value in values.values():
         if isinstance(value, Path) and _URL.match(str(value)) and not value.exists():
             raise UsageError(
                 "url-not-local",
                 given=f"{str(value).replace(':/', '://', 1)} is a URL.",
                 wanted="A file or folder of this machine.",
-                hint="Copy it here first, for example with rclone.",
+                hint="`splat batch` reads captures from URLs and writes runs to them: splat batch "
+                "PHOTOS --out URL. Copy other files first.",
             )
 
 

@@ -21,7 +21,7 @@ DEFAULT_PRESET = "standard"
 # Options that describe one capture: a batch gives the same options to all of its runs.
 _OF_ONE_CAPTURE = (
     *("masks", "depth", "cameras", "split", "refine_cameras"),
-    *("scale", "view"),
+    *("scale", "blocks", "view"),
 )
 
 

@@ -25,6 +25,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("stages.proof", "stages.mesh"),
     ("stages.export",),
     ("stages.tradeoff", "stages.editing", "stages.viewer", "stages.run"),
+    ("stages.distributed",),
     ("splatcli",),
 )
 

@@ -143,6 +143,8 @@ LATE = {
     "flip_evaluator": "needs no more than the views that are compared",
     "av": "holds libraries that a run without videos need not load",
     "pyproj": "comes with the extra `geo`",
+    "ray": "comes with the extra `cluster`",
+    "fsspec": "comes with the extra `cluster`",
     "filelock": "takes longer than `splat --help` has",
 }
 MOST_LATE_IMPORTS = 60

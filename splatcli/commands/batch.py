@@ -2,33 +2,37 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from splatcli import console, log, options, progress, run_settings
-from stages.base.atomic import make_folder
-from stages.run.batch import BatchTable, Result, Row, run_capture, run_names
-from stages.run.lock import locked
-from stages.run.runfolder import check_outside
+from splatcli.arguments import Cluster
+from stages.distributed import remote
+from stages.distributed.batch import BatchTable, Row, check_output, run_names
+from stages.distributed.cluster import open_executor
+from stages.distributed.tasks import TaskResult, resources_of, task_for
 
 
 def batch(
     captures: Annotated[
-        list[Path],
-        typer.Argument(help="Folders of photographs, or videos: one run for each."),
+        list[str],
+        typer.Argument(
+            help="Folders of photographs, or videos: one run for each. Also URLs that fsspec "
+            "knows, such as 's3://bucket/captures/*'."
+        ),
     ],
     *,
     out: Annotated[
-        Path,
+        str,
         typer.Option(
             "--out",
             "-o",
-            help="Folder for the run folders and batch.csv.",
+            help="Folder, or URL, for the run folders and batch.csv.",
             rich_help_panel="Output",
         ),
-    ] = Path("runs"),
+    ] = "runs",
+    cluster: Cluster = None,
     **given: Any,
 ) -> None:
     """Many captures: `splat process` for each, into a run folder of its name.
@@ -38,15 +42,17 @@ def batch(
     """
     settings = run_settings.of_new_run(options.given_only(given))
     log.write_settings(settings)
-    runs = run_names(captures)
-    for photos in captures:
-        check_outside(out, photos)
+    runs = remote.parse_location(out)
+    photos = run_names(remote.expand_locations(captures))
+    check_output(runs, [*photos.values()])
+    tasks = [task_for(remote.joined(runs, name), path, settings) for name, path in photos.items()]
     bars = progress.Bars() if console.mode.has_notes and console.err.is_terminal else None
-    make_folder(out)
-    with locked(out):
-        table = BatchTable(out, list(runs))
-        for number, (name, photos) in enumerate(runs.items()):
-            result = run_capture(out / name, photos, settings, bars)
+    with (
+        remote.prepare_output(runs) as local_folder,
+        open_executor(cluster, runs, photos.values(), bars) as executor,
+    ):
+        table = BatchTable(local_folder, runs, list(photos))
+        for number, result in executor.results(tasks, resources_of(settings["train"])):
             table.ended(number, result)
             _report(table.rows[number], result)
         table.write()
@@ -55,7 +61,7 @@ def batch(
         raise typer.Exit(table.worst_status)
 
 
-def _report(row: Row, result: Result) -> None:
+def _report(row: Row, result: TaskResult) -> None:
     """Print a line, or an event, for a run that ended."""
     if console.mode.as_json:
         console.emit("ended", **vars(row), exit_status=result.status, message=result.message)
@@ -69,7 +75,7 @@ def _report(row: Row, result: Result) -> None:
 def _print(table: BatchTable) -> None:
     """The whole table, once all runs have ended."""
     if console.mode.as_json:
-        console.emit("result", folder=str(table.folder), rows=[vars(row) for row in table.rows])
+        console.emit("result", folder=str(table.runs), rows=[vars(row) for row in table.rows])
         return
     if not console.mode.quiet:
         console.table(
@@ -87,7 +93,7 @@ def _print(table: BatchTable) -> None:
                 for row in table.rows
             ],
         )
-    console.out.print(str(table.file), markup=False)
+    console.out.print(str(table.location), markup=False)
 
 
 def _db(row: Row) -> str:

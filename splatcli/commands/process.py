@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from splatcli import console, log, options, progress, run_result, run_settings
-from splatcli.arguments import Out, Photos, Run
+from splatcli.arguments import Cluster, Out, Photos, Run
 from splatcli.folders import DEFAULT, find_run_folder, run_folder_for
 from stages.base.errors import UsageError
 from stages.base.settings import changed
@@ -21,13 +21,21 @@ from stages.viewer.live_training import LiveTraining
 from stages.viewer.server import open_in_browser
 
 
-def process(photos: Photos = None, *, out: Out = None, **given: Any) -> None:
+def process(
+    photos: Photos = None,
+    *,
+    out: Out = None,
+    cluster: Cluster = None,
+    **given: Any,
+) -> None:
     """Photographs in, assets out: all seven stages.
 
     Finished work is kept: after an interruption the same command goes on where it stopped.
     """
+    from splatcli.distribution import distributed  # loads training, which `--help` does not need
+
     run_folder, photos = _run_folder_and_photos(photos, out)
-    pipeline = Pipeline(run_folder, photos)
+    pipeline = distributed(Pipeline(run_folder, photos), cluster)
     given = options.given_only(given)
     view, preset = given.pop("view", False), given.pop("preset", None)
     if "formats" in given:
@@ -82,6 +90,8 @@ def _run_folder_and_photos(photos: Path | None, out: Path | None) -> tuple[Path,
 def _run_stage(name: str, pipeline: Pipeline, given: Mapping[str, Any]) -> None:
     """One stage, with the recorded settings and the given options. Stages after training take
     little time: where some are missing before this one, they run too."""
+    from splatcli.distribution import distributed  # loads training, which `--help` does not need
+
     is_known = runfolder.is_run_folder(pipeline.run_folder)
     base = run_settings.recorded(pipeline)
     given = options.given_only(given)
@@ -102,7 +112,7 @@ def _run_stage(name: str, pipeline: Pipeline, given: Mapping[str, Any]) -> None:
         console.note(run_settings.training_summary(settings["train"], given, preset))
     after_training = STAGE_NAMES[STAGE_NAMES.index("train") + 1 :]
     _run(
-        pipeline,
+        distributed(pipeline),
         settings,
         until=name,
         may_run=after_training if name in after_training else (name,),

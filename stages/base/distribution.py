@@ -10,5 +10,5 @@ VERSION = "0.2.0"
 
 
 def install_command(extra: str = "") -> str:
-    """What to type to install the project; extra: a set of optional dependencies ("geo")."""
+    """What to type to install the project; extra: a set of optional dependencies ("cluster")."""
     return f'pip install "{NAME}[{extra}]"' if extra else f"pip install {NAME}"

@@ -2,5 +2,6 @@
 
 In reading order: `camera_file` (what every reader returns), `camera_formats` (the list of formats,
 and how to add one), `lens` and `undistortion` (camera models), then the formats: `colmap` with
-`colmap_records`, `nerfstudio`, `blender`, `llff`, `opensfm`, `metashape`, `realityscan`, `arkit`.
+`colmap_records`, `nerfstudio`, `blender`, `llff`, `opensfm`, `bundler`, `metashape`, `realityscan`,
+`realityscan_xmp`, `opf`, `arkit`.
 """

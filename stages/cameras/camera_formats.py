@@ -21,12 +21,15 @@ from stages.base.errors import UsageError
 from stages.cameras import (
     arkit,
     blender,
+    bundler,
     colmap,
     llff,
     metashape,
     nerfstudio,
     opensfm,
+    opf,
     realityscan,
+    realityscan_xmp,
 )
 from stages.cameras.camera_file import CameraFile, FilePoints
 
@@ -74,14 +77,16 @@ CAMERA_FILES = (
         *(colmap.locate, colmap.read, colmap.read_points, colmap.files),
     ),
     CameraFormat("LLFF's poses_bounds.npy", llff.locate, llff.read),
+    CameraFormat("Bundler's .out", _suffixed(".out"), bundler.read, bundler.read_points),
     CameraFormat("Metashape's cameras as .xml", _suffixed(".xml"), metashape.read),
     CameraFormat("RealityScan's camera parameters as .csv", _suffixed(".csv"), realityscan.read),
+    CameraFormat(
+        "a folder with RealityScan's .xmp beside the photographs",
+        *(realityscan_xmp.locate, realityscan_xmp.read),
+    ),
+    CameraFormat("Pix4D's project.opf", opf.locate, opf.read, files=opf.files),
 )
-_INSTEAD = {
-    ".geojson": "For ODM's cameras, name opensfm/reconstruction.json of its project.",
-    ".opf": "Pix4D's own pyopf converts it: `opf2nerf project.opf` writes a transforms.json.",
-}
-_READ_TOGETHER = (".json", ".bin", ".txt", ".npy", ".ply")  # in a folder of cameras
+_READ_TOGETHER = (".json", ".bin", ".txt", ".npy", ".ply", ".xmp")  # in a folder of cameras
 
 
 def read_cameras(path: Path) -> CameraFile:
@@ -113,10 +118,9 @@ def _located(path: Path) -> tuple[CameraFormat, Path]:
     for row in CAMERA_FILES:
         if located := row.locate(path):
             return row, located
-    hint = _INSTEAD.get(
-        path.suffix.lower(),
-        "Check the path; a run's cameras are written by `splat cameras RUN OUT`.",
-    )
+    hint = "Check the path; a run's cameras are written by `splat cameras RUN OUT`."
+    if path.suffix.lower() == ".geojson":
+        hint = "For ODM's cameras, name opensfm/reconstruction.json of its project."
     raise UsageError(
         "cameras-unknown",
         given=f"{path} is not a known camera file.",

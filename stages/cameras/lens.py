@@ -28,12 +28,13 @@ class Lens:
 
     Args:
         kind: "perspective", "fisheye" (angle from the axis instead of its tangent), "prism fisheye"
-            (the same, tangential terms after the radial ones), "fov", "division" or "eucm".
+            (the same, tangential terms after the radial ones), "polynomial fisheye" (every power of
+            the angle in quarter turns), "fov", "division" or "eucm".
         radial: factors of r^2, r^4, ... in 1 + ...
         denominator: the same in the denominator.
         tangential: p1 and p2 in OpenCV's order.
         prism: factors of r^2 and r^4 that are added to u, then to v.
-        parameters: of the last three kinds.
+        parameters: of the last four kinds.
         skew: of the other kinds, the share of v that is added to u at the end.
     """
 
@@ -141,6 +142,11 @@ class Lens:
             (omega,) = self.parameters
             r = np.sqrt(r2)
             return uv * _ratio(np.arctan(2 * r * np.tan(omega / 2)) / omega, r)
+        if self.kind == "polynomial fisheye":
+            quarter = np.sqrt(r2) * (2 / np.pi)
+            return self._skewed(
+                uv * (1.0 + quarter * np.polynomial.polynomial.polyval(quarter, self.parameters))
+            )
         if self.kind == "division":
             (k,) = self.parameters
             with np.errstate(invalid="ignore"):
@@ -150,7 +156,10 @@ class Lens:
             return np.asarray(uv / (alpha * np.sqrt(beta * r2 + 1.0) + 1.0 - alpha))
         scaled = uv * (_polynomial(self.radial, r2) / _polynomial(self.denominator, r2))
         moved = scaled + self._shift(scaled if self.kind == "prism fisheye" else uv)
-        return moved + moved[..., 1:] * (self.skew, 0.0) if self.skew else moved
+        return self._skewed(moved)
+
+    def _skewed(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
+        return uv + uv[..., 1:] * (self.skew, 0.0) if self.skew else uv
 
     def _shift(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
         """The tangential and prism terms."""

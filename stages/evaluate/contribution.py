@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.evaluate.evaluation import EvaluationView
+from stages.evaluate.evaluation import EvaluationView, image_renderer
 from stages.evaluate.image_metrics import capped_psnr_db
 from stages.raster.backends import rasteriser_of
 from stages.raster.definition import (
@@ -279,6 +279,15 @@ def colours_by_degree(splats: Splats, centre: NDArray[np.floating]) -> NDArray[n
     terms = basis[:, :, None] * splats.sh
     ends = np.arange(1, splats.sh_degree + 2) ** 2 - 1
     return np.maximum(0.5 + np.cumsum(terms, axis=1)[:, ends], 0.0)
+
+
+def squared_error(splats: Splats, views: Iterable[EvaluationView], backend: str) -> float:
+    """The squared error of the pictures, summed over pixels and channels of all views."""
+    draw, found = image_renderer(splats, backend), 0.0
+    for view in views:
+        squares = np.square(draw(view.camera) - view.image, dtype=np.float64)
+        found += float(squares.sum() if view.valid is None else squares[view.valid].sum())
+    return found
 
 
 def near_view_frusta(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from threading import Event
@@ -46,6 +47,12 @@ class Pipeline:
         self.run_folder = Path(run_folder)
         self.photos = Path(photos).absolute() if photos is not None else None
         self.layout = Layout(self.run_folder, every)
+
+    def with_run(self, name: str, run: Callable[..., Any]) -> Pipeline:
+        """This pipeline with another function for a stage. It must give the same output."""
+        stages = (replace(s, run=run) if s.name == name else s for s in self.layout.stages)
+        self.layout = replace(self.layout, stages=tuple(stages))
+        return self
 
     def stage_folder(self, name: str) -> Path:
         """Folder of the finished output of a stage; it need not exist yet."""

@@ -43,7 +43,7 @@ class SfmSettings:
     cameras: Path | None = setting(
         None,
         "File or folder of known camera poses, of COLMAP, nerfstudio, a synthetic NeRF "
-        "scene, LLFF, OpenSfM, ODM, Metashape, RealityScan, ARKit or Polycam; they "
+        "scene, LLFF, OpenSfM, ODM, Bundler, Metashape, RealityScan, Pix4D, ARKit or Polycam; they "
         "are not estimated.",
         panel="Known cameras",
         affects_output=False,  # its content does, and that is an input

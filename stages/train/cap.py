@@ -24,6 +24,7 @@ DEVICE_MEMORY = "the GPU's memory"
 PHOTOGRAPHS = "the photographs' pixels"
 BYTES_PER_SPLAT = 1600  # parameters, moments, gradients, footprint and about 6 intersections
 MIN_CAP = 10_000  # splats that are always allowed
+BASE_MIB = 2048.0  # libraries, and at most 1 GiB of photographs
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,11 @@ def splat_cap(free_mib: float) -> int:
 def memory_mib(splats: int) -> float:
     """Memory that `splats` splats take in training."""
     return splats * BYTES_PER_SPLAT / (1024 * 1024)
+
+
+def needed_mib(splats: int) -> float:
+    """Memory of one run, all its stages, that trains at most `splats` splats."""
+    return BASE_MIB + memory_mib(splats)
 
 
 def cap_for(folder: Path, max_splats: int, determined: int) -> Cap:

@@ -78,6 +78,14 @@ class TrainSettings:
         panel="Known cameras",
     )
     drawing: str = drawing_setting()
+    blocks: str = setting(
+        "1",
+        "Divide the scene into this many blocks, train each on the photographs that "
+        "show it, and merge them; auto: one block for about every 250 photographs.",
+        panel="Advanced",
+        pattern=r"auto|[1-9]\d{0,3}",
+        wanted="A whole number of blocks, or auto.",
+    )
     within: tuple[float, ...] = setting(
         (),
         "Densify only inside this rectangle of the ground plane (world units); the "

@@ -57,6 +57,8 @@ def run(
 
     Raises Interrupted, and SplatError: raster-gpu-memory, train-nothing-left.
     """
+    if settings.blocks != "1":
+        raise ValueError("blocks are runs of their own: stages.distributed.blocks trains them")
     started = time.monotonic()
     reconstruction: Reconstruction = inputs["sfm"]
     start: Splats = inputs["seed"]

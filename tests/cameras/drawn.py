@@ -173,6 +173,32 @@ def opensfm(folder: Path) -> Path:
     return folder / "reconstruction.json"
 
 
+def bundler(folder: Path) -> Path:
+    """The manual: P = R X + t, p = -P / P.z, p' = f r(p) p, from the middle, y up."""
+    lines = ["# Bundle file v0.3", f"{len(POSES) + 1} {len(POINTS)}", *["0 0 0"] * 5]
+    projects = []
+    for pose in POSES:
+        turned = OPENGL @ pose
+
+        def project(points: NDArray[np.float64], turned: NDArray = turned) -> NDArray[np.float64]:
+            at = points @ turned[:3, :3].T + turned[:3, 3]
+            p = -at[:, :2] / at[:, 2:]
+            r2 = (p * p).sum(axis=1, keepdims=True)
+            x, y = (FOCAL * (1 + K1 * r2 + K2 * r2 * r2) * p).T
+            return np.stack([WIDTH / 2 + x, HEIGHT / 2 - y], axis=1)
+
+        projects.append(project)
+        lines.append(f"{FOCAL} {K1} {K2}")
+        lines += [" ".join(map(repr, map(float, row))) for row in turned[:3, :3]]
+        lines.append(" ".join(map(repr, map(float, turned[:3, 3]))))
+    for point, colour in zip(POINTS, COLOURS, strict=True):
+        lines += [" ".join(map(repr, map(float, point))), " ".join(map(str, colour)), "1 0 0 1 1"]
+    draw(folder, projects)
+    (folder / "bundle.out").write_text("\n".join(lines) + "\n")
+    (folder / "list.txt").write_text("\n".join(["lost.png", *NAMES]) + "\n")
+    return folder / "bundle.out"
+
+
 def metashape(folder: Path) -> Path:
     """The manual: x' = x (1 + K1 r^2 + K2 r^4) + P1 (r^2 + 2 x^2) + 2 P2 x y, y' likewise,
     u = w / 2 + cx + x' f + x' B1 + y' B2, v = h / 2 + cy + y' f; camera to world, x right, y
@@ -249,4 +275,5 @@ MADE = {
     "blender": blender,
     "llff": llff,
     "opensfm": opensfm,
+    "bundler": bundler,
 }

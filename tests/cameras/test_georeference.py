@@ -13,7 +13,7 @@ from stages.cameras.camera_file import Georeference
 from stages.cameras.camera_formats import read_cameras
 from stages.scene.place import GEOGRAPHIC
 from tests.cameras.drawn import CHUNK, EYES, metashape, opensfm
-from tests.cameras.drawn_surveys import MADE, arkit, polycam
+from tests.cameras.drawn_surveys import MADE, SHIFT, UTM32, arkit, opf, polycam
 
 TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
 LOCAL = CHUNK[CHUNK.index("LOCAL_CS") : CHUNK.index("</reference>")]
@@ -84,7 +84,7 @@ def test_opensfm_with_a_reference_is_in_metres_as_far_as_gps_agrees(tmp_path: Pa
     assert referenced(tmp_path / "d", 48.1, 5 * EYES).metres_per_unit == 0.0
 
 
-SAYING = {"opensfm", "metashape", "arkit"}
+SAYING = {"opensfm", "metashape", "arkit", "opf"}
 
 
 @pytest.mark.parametrize("name", sorted(MADE.keys() - SAYING))
@@ -117,3 +117,34 @@ def test_phones_are_in_metres_with_their_up_and_no_place(tmp_path: Path, read: A
     assert (ground.metres_per_unit, ground.place) == (1.0, None)
     assert ground.axes is not None
     np.testing.assert_array_equal(ground.axes[2], [0, 1, 0])
+
+
+@pytest.mark.parametrize(
+    ("definition", "crs"),
+    [
+        (UTM32, "EPSG:32632"),
+        ("EPSG:32632", "EPSG:32632"),
+        ("EPSG:32632+5773", "EPSG:32632"),
+        ('ENGCRS["Site",EDATUM["Corner"],CS[Cartesian,3],LENGTHUNIT["metre",1.0]]', None),
+    ],
+)
+def test_opfs_reference_frame_is_the_place_of_its_world(
+    tmp_path: Path, definition: str, crs: str | None
+) -> None:
+    path = opf(tmp_path)
+    frame = tmp_path / "scene-reference-frame.json"
+    frame.write_text(
+        json.dumps(json.loads(frame.read_text()) | {"crs": {"definition": definition}})
+    )
+    ground = read_cameras(path).georeference
+    assert ground.metres_per_unit == 1.0
+    assert (ground.place.crs if ground.place else None) == crs
+    if ground.place:
+        np.testing.assert_array_equal(ground.place.offset, np.negative(SHIFT))
+
+
+def test_opf_in_feet_is_arbitrary(tmp_path: Path) -> None:
+    path = opf(tmp_path)
+    frame = tmp_path / "scene-reference-frame.json"
+    frame.write_text(frame.read_text().replace("[1, 1, 1]", "[0.3048, 0.3048, 1]"))
+    assert read_cameras(path).georeference.metres_per_unit == 0.0

@@ -12,6 +12,7 @@ FISHEYES = {
     "equidistant": Lens("fisheye"),
     "radial": Lens("fisheye", (-0.03, 0.004, -0.0005)),
     "prism": Lens("prism fisheye", (-0.02,), tangential=(1e-3, -2e-3), prism=(1e-3, 0, 2e-3, 0)),
+    "polynomial": Lens("polynomial fisheye", parameters=(0.01, -0.05)),
 }
 _LARGE = {"omega": 0.9, "alpha": 0.6, "beta": 1.2}
 

@@ -55,7 +55,7 @@ def test_points_are_where_the_pictures_show_them(tmp_path: Path, name: str) -> N
         assert np.mean(hit) >= 0.8  # discs may cover each other
 
 
-@pytest.mark.parametrize("name", ["colmap", "opensfm"])
+@pytest.mark.parametrize("name", ["colmap", "opensfm", "bundler"])
 def test_points_of_the_file_are_in_the_cameras_world(tmp_path: Path, name: str) -> None:
     found = read_points(MADE[name](tmp_path))
     assert found is not None
@@ -119,9 +119,13 @@ def _cut(path: Path) -> None:
         ("blender", "transforms_test.json"),
         ("llff", "poses_bounds.npy"),
         ("opensfm", "reconstruction.json"),
+        ("bundler", "bundle.out"),
         ("metashape", "cameras.xml"),
         ("realityscan", "cameras.csv"),
         ("arkit", "frame_00006.json"),
+        ("realityscan_xmp", "p_2.xmp"),
+        ("opf", "project.opf"),
+        ("opf", "calibrated-cameras.json"),
     ],
 )
 def test_half_a_file_is_refused_in_words(tmp_path: Path, name: str, file: str) -> None:
@@ -131,6 +135,17 @@ def test_half_a_file_is_refused_in_words(tmp_path: Path, name: str, file: str) -
         read_cameras(path)
     assert caught.value.code == "cameras-unreadable"
     assert file in caught.value.given
+
+
+def test_bundlers_pictures_outside_its_folder_are_not_opened(tmp_path: Path) -> None:
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    path = MADE["bundler"](tmp_path / "a" / "b")
+    names = (path.parent / "list.txt").read_text().splitlines()
+    (path.parent / names[1]).rename(tmp_path / "other.png")
+    names[1] = "../../other.png"
+    (path.parent / "list.txt").write_text("\n".join(names))
+    with pytest.raises(SplatError, match="which is outside"):
+        read_cameras(path)
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-16", "utf-16-le", "utf-16-be"])
@@ -144,7 +159,15 @@ def test_entities_of_xml_are_refused_in_every_encoding(tmp_path: Path, encoding:
         read_cameras(path)
 
 
-@pytest.mark.parametrize("name", ["cameras.json", "cameras.xml", "cameras.csv"])
+def test_bundlers_missing_list_may_be_written(tmp_path: Path) -> None:
+    path = MADE["bundler"](tmp_path)
+    (tmp_path / "list.txt").unlink()
+    with pytest.raises(SplatError, match="no list of pictures") as caught:
+        read_cameras(path)
+    assert f"Write {tmp_path / 'list.txt'}" in caught.value.hint
+
+
+@pytest.mark.parametrize("name", ["cameras.json", "cameras.xml", "cameras.csv", "cameras.out"])
 def test_gigabytes_are_refused_before_they_are_read(tmp_path: Path, name: str) -> None:
     with (tmp_path / name).open("wb") as file:
         file.write(b'{"frames": [')

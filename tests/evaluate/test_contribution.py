@@ -2,27 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from stages.evaluate.contribution import colours_by_degree, measure_contributions
-from stages.evaluate.evaluation import EvaluationView, image_renderer, load_evaluation_views
+from stages.evaluate.contribution import colours_by_degree, measure_contributions, squared_error
+from stages.evaluate.evaluation import image_renderer, load_evaluation_views
 from stages.evaluate.selection import Removal
 from stages.scene import Splats
 from tests.formats.truth import colour, many_splats
 from tests.small_scene import small_scene
-
-
-def squared_error(splats: Splats, views: Iterable[EvaluationView]) -> float:
-    """The squared error of the pictures, summed over pixels and channels of all views."""
-    draw, found = image_renderer(splats, "cpu"), 0.0
-    for view in views:
-        squares = np.square(draw(view.camera) - view.image, dtype=np.float64)
-        found += float(squares.sum() if view.valid is None else squares[view.valid].sum())
-    return found
 
 
 def without(splats: Splats, row: int, degree: int, added: np.ndarray) -> Splats:
@@ -42,11 +32,11 @@ def test_the_predicted_change_of_the_error_is_that_of_drawing_without_the_coeffi
         scene.reconstruction.folder, scene.reconstruction.views, splats.draw_settings
     )
     contributions = measure_contributions(splats, photographs, "cpu")
-    assert contributions.sse == pytest.approx(squared_error(splats, photographs), rel=1e-5)
+    assert contributions.sse == pytest.approx(squared_error(splats, photographs, "cpu"), rel=1e-5)
     for row in (0, 10, 20):
         for degree in (0, 1):
             cut = without(splats, row, degree, contributions.truncated_colour[row, degree])
-            change = squared_error(cut, photographs) - contributions.sse
+            change = squared_error(cut, photographs, "cpu") - contributions.sse
             assert contributions.truncated_sse_change[row, degree] == pytest.approx(
                 change, rel=2e-3, abs=1e-5
             )

@@ -6,6 +6,7 @@ import functools
 import io
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -14,12 +15,15 @@ import numpy as np
 from stages.cameras import (
     arkit,
     blender,
+    bundler,
     colmap,
     llff,
     metashape,
     nerfstudio,
     opensfm,
+    opf,
     realityscan,
+    realityscan_xmp,
 )
 from stages.scene import Camera, View
 from tests.cameras.drawn_surveys import MADE, NAMES
@@ -158,6 +162,10 @@ def _other(module: ModuleType, name: str, text: bool = True, source: str = "") -
     return Layer(name, lambda: _drawn(kind)[name], beside=beside, text=text, read=read, holds=4)
 
 
+def _bundle_of_list(path: Path) -> int:
+    return _checked([view.camera for view in bundler.read(path.with_name("bundle.out")).views])
+
+
 def _content(kind: str, name: str) -> Callable[[], bytes]:
     return lambda: _files(kind)[name]
 
@@ -168,7 +176,15 @@ LAYERS = {
     "OpenSfM reconstruction.json": _other(opensfm, "reconstruction.json"),
     "Metashape cameras.xml": _other(metashape, "cameras.xml"),
     "RealityScan cameras.csv": _other(realityscan, "cameras.csv"),
+    "Bundler bundle.out": _other(bundler, "bundle.out"),
+    "Bundler list.txt": replace(_other(bundler, "list.txt"), read=_bundle_of_list),
     "ARKit frame_00006.json": _other(arkit, "frame_00006.json", source="."),
+    "RealityScan .xmp": _other(realityscan_xmp, "p_1.xmp", source="."),
+    "OPF project.opf": _other(opf, "project.opf"),
+    **{
+        f"OPF {part}.json": _other(opf, f"{part}.json", source="project.opf")
+        for part in ("calibrated-cameras", "input-cameras", "scene-reference-frame")
+    },
     "transforms.json": Layer(
         "transforms.json",
         _content("json", "transforms.json"),

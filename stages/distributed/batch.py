@@ -1,26 +1,23 @@
-"""Runs of many captures, one after the other: their names, and the table of their results."""
+"""Runs of many captures: their names, and the table of their results."""
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import astuple, dataclass, fields, replace
 from pathlib import Path
-from typing import Any
 
 from stages.base.atomic import write_csv
-from stages.base.errors import CRASHED, Interrupted, SplatError, UsageError
-from stages.base.text import reason_of
-from stages.run.failures import as_splat_error
-from stages.run.listener import Listener
+from stages.base.errors import SplatError, UsageError
+from stages.distributed import remote
+from stages.distributed.remote import Location
+from stages.distributed.tasks import TaskResult
+from stages.run import runfolder
 from stages.run.manifest import Manifest
-from stages.run.pipeline import Pipeline
 from stages.run.stages import STAGE_NAMES
 
 FILE_NAME = "batch.csv"
 WAITING, DONE = "waiting", "done"
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -41,68 +38,58 @@ class Row:
     warnings: str = ""
 
 
-@dataclass(frozen=True)
-class Result:
-    """How a run ended. status: exit status. code, message: of the error; "" if there was none."""
-
-    status: int = 0
-    code: str = ""
-    message: str = ""
-
-
-def run_names(captures: Sequence[Path]) -> dict[str, Path]:
-    """Captures by the name of their run folder: the name of the folder, or of the video without its
-    suffix. Raises SplatError "batch-same-name"."""
-    runs: dict[str, Path] = {}
-    taken: dict[str, Path] = {}
-    for path in captures:
-        name = path.absolute().stem if path.is_file() else path.absolute().name
+def run_names(captures: Sequence[Location]) -> dict[str, Location]:
+    """Captures by the name of their run folder: the name of the folder or of the video. Raises
+    SplatError "batch-same-name"."""
+    runs: dict[str, Location] = {}
+    taken: dict[str, Location] = {}
+    for location in captures:
+        name = remote.capture_name(location)
         if not name or name.casefold() in taken:
-            other = taken.get(name.casefold(), path)
+            other = taken.get(name.casefold(), location)
             raise UsageError(
                 "batch-same-name",
-                given=f"{other} and {path} would both be the run {name or 'without a name'}.",
+                given=f"{other} and {location} would both be the run {name or 'without a name'}.",
                 wanted="Captures of different names: each gives its run folder its own.",
                 hint="Name the folders above them (captures/*), or rename one.",
             )
-        runs[name] = taken[name.casefold()] = path
+        runs[name] = taken[name.casefold()] = location
     return runs
 
 
-def run_capture(
-    run_folder: Path, photos: Path, settings: Mapping[str, Any], listener: Listener | None
-) -> Result:
-    """Run all stages. A failure becomes a result; only Interrupted is raised."""
-    try:
-        Pipeline(run_folder, photos).run(settings, listener=listener)
-    except Interrupted:
-        raise
-    except Exception as error:
-        _log.debug("%s failed", run_folder, exc_info=error)
-        known = as_splat_error(error, "the run", run_folder)
-        if known is None:
-            return Result(CRASHED, "bug", f"{type(error).__name__}: {reason_of(error)}.")
-        return Result(int(known.family), known.code, known.given)
-    return Result()
+def check_output(runs: Location, captures: Sequence[Location]) -> None:
+    """Raises SplatError "run-folder-inside-photographs" for run folders among photographs."""
+    for location in captures:
+        if isinstance(runs, Path) and isinstance(location, Path):
+            runfolder.check_outside(runs, location)
 
 
 class BatchTable:
     """The results of all runs, kept in batch.csv.
 
     Args:
-        folder: has the run folders.
+        folder: a local folder with the run folders, or with copies of their manifests.
+        runs: the location of the run folders.
         names: of the run folders.
     """
 
-    def __init__(self, folder: Path, names: Sequence[str]) -> None:
-        self.folder, self.file = folder, folder / FILE_NAME
+    def __init__(self, folder: Path, runs: Location, names: Sequence[str]) -> None:
+        self.folder, self.runs = folder, runs
         self.rows = [Row(name) for name in names]
         self.worst_status = 0
         self.write()
 
-    def ended(self, number: int, result: Result) -> None:
+    @property
+    def location(self) -> Location:
+        """The location of batch.csv."""
+        return remote.joined(self.runs, FILE_NAME)
+
+    def ended(self, number: int, result: TaskResult) -> None:
         """Record the result of a run."""
-        row = row_of(self.folder / self.rows[number].capture)
+        name = self.rows[number].capture
+        with suppress(SplatError):  # the figures stay blank
+            remote.fetch_manifests(self.runs, name, self.folder)
+        row = row_of(self.folder / name)
         self.rows[number] = replace(row, status=result.code or DONE)
         self.worst_status = max(self.worst_status, result.status)
         with suppress(SplatError):  # a full disk makes the runs fail; the batch goes on
@@ -111,7 +98,9 @@ class BatchTable:
     def write(self) -> None:
         """Write batch.csv, whole or not at all. Raises SplatError."""
         names = [field.name for field in fields(Row)]
-        write_csv(self.file, (names, *map(astuple, self.rows)))
+        write_csv(self.folder / FILE_NAME, (names, *map(astuple, self.rows)))
+        if isinstance(self.runs, str):
+            remote.RemoteFolder.at(self.runs).put(self.folder, [FILE_NAME])
 
 
 def row_of(run_folder: Path) -> Row:

@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import csv
 import errno
+import importlib.metadata
 import json
+import subprocess
+import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from stages.base.errors import SplatError
+from stages.distributed import cluster
+from stages.distributed.tasks import Resources
 from stages.run.lock import locked
 from tests.cli.pretence import failing_at
 
@@ -105,9 +111,67 @@ def test_two_batches_in_one_folder_are_refused(splat, captures) -> None:
     assert "run-folder-busy" in result.stderr
 
 
-@pytest.mark.parametrize("words", [("process", "photos", "--out"), ("batch", "photos"), ("batch",)])
-def test_a_url_where_a_path_is_wanted_is_refused(splat, words: tuple[str, ...]) -> None:
-    result = splat(*words, "s3://bucket/run")
+def test_without_ray_a_cluster_is_refused_and_nothing_else(splat, captures, monkeypatch) -> None:
+    real = importlib.import_module
+
+    def without_ray(name: str, package: str | None = None):
+        if name == "ray":
+            raise ImportError(name)
+        return real(name, package)
+
+    monkeypatch.setattr(importlib, "import_module", without_ray)
+    result = splat("batch", *captures, "--cluster", "local:2")
     assert result.exit_code == 2
-    assert "s3://bucket/run is a URL" in result.stderr
-    assert not Path("s3:").exists()
+    assert 'pip install "splatcli[cluster]"' in result.stderr
+    assert splat("batch", *captures).exit_code == 0
+
+
+def test_nothing_imports_ray_unless_a_cluster_is_asked_for() -> None:
+    code = (
+        "import sys\n"
+        "import splatcli.app, splatcli.commands.batch\n"
+        "import stages.distributed.cluster, stages.distributed.tasks\n"
+        "print('ray' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
+def answer(**changes) -> cluster.Worker:
+    return replace(cluster.Worker("b7", "2", (), 4, 9000.0), **changes)
+
+
+def test_a_worker_with_another_splat_is_refused_and_both_are_named(tmp_path) -> None:
+    with pytest.raises(SplatError, match="b7 has splat 1; here it is splat 2") as found:
+        cluster.check([answer(), answer(edition="1")], "2", tmp_path / "t")
+    assert found.value.code == "cluster-other-splat"
+
+
+def test_a_folder_that_a_worker_does_not_see_is_named(tmp_path) -> None:
+    token = tmp_path / "runs" / ".seen"
+    with pytest.raises(SplatError, match=r"b7 does not see .*runs\.") as found:
+        cluster.check([answer(unseen=(str(token),))], "2", token)
+    assert found.value.code == "cluster-folder-unseen"
+    with pytest.raises(SplatError, match="does not see /photos/x"):
+        cluster.check([answer(unseen=("/photos/x",))], "2", token)
+
+
+@pytest.mark.parametrize(
+    ("tasks", "workers", "memory_mib", "wanted"),
+    [
+        (100, [answer(), answer()], 3000.0, (1, 3000.0)),
+        (2, [answer(), answer(cpus=8, memory_mib=500.0)], 400.0, (4, 400.0)),
+        (1, [answer()], None, (4, 9000.0)),
+    ],
+)
+def test_tasks_share_the_processors_and_take_the_memory_they_need(
+    tasks, workers, memory_mib, wanted
+) -> None:
+    found = cluster.RayExecutor(None, tuple(workers))
+    assert found.allocation(tasks, Resources(memory_mib)) == wanted
+
+
+def test_a_run_that_no_worker_has_the_memory_for_is_refused() -> None:
+    """Ray would wait for such a worker for ever."""
+    with pytest.raises(SplatError, match="20,000 MiB, and no worker has more than 9,000"):
+        cluster.RayExecutor(None, (answer(),)).allocation(1, Resources(20_000.0))
