@@ -16,7 +16,6 @@ from typing import Any
 
 import typer
 from rich.console import Console, ConsoleOptions, RenderableType
-from rich.filesize import decimal
 from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
@@ -24,6 +23,7 @@ from rich.text import Text
 from splatcli import log
 from stages.base.errors import CRASHED, STOPPED, Interrupted, ResourceError, SplatError, UsageError
 from stages.base.text import printable, printable_name
+from stages.base.text import size as size
 from stages.run.failures import as_splat_error
 
 
@@ -157,8 +157,8 @@ def show_error(error: SplatError) -> int:
         with suppress(SplatError):  # it is printed below, for a reader
             emit("error", **error.as_dict())
             return int(error.family)
-    err.print(Text("Error: ", style="bold red") + Text(printable_name(error.given)))
-    err.print(Text("Wanted: ", style="bold") + Text(printable_name(error.wanted)))
+    paragraph(err, Text("Error: ", style="bold red") + Text(printable_name(error.given)))
+    paragraph(err, Text("Wanted: ", style="bold") + Text(printable_name(error.wanted)))
     err.print(Text("Next: ", style="bold") + Text(printable_name(error.hint)))
     err.print(Text(f"({error.code}, exit status {int(error.family)})", style="dim"))
     return int(error.family)
@@ -219,7 +219,13 @@ def note(text: str, style: str = "") -> None:
 
 def warn(text: str) -> None:
     """One warning, on standard error."""
-    note(text, "yellow")
+    paragraph(err, Text(text, style="yellow"))
+
+
+def paragraph(screen: Console, text: Text) -> None:
+    """Print a sentence or several. A terminal gets lines that end between words; a file gets one
+    line."""
+    screen.print(text, soft_wrap=not screen.is_terminal)
 
 
 def step(label: str, **counts: int) -> None:
@@ -270,11 +276,6 @@ def figure(name: str, value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}{unit}" if abs(value) < 1e4 else f"{value:,.0f}{unit}"
     return f"{value}{unit}"
-
-
-def size(count: float) -> str:
-    """Bytes as people read them: "1.3 MB"."""
-    return decimal(int(count))
 
 
 def fidelity(psnr_db: float) -> str:

@@ -54,7 +54,7 @@ class Quiet(Listener):
 def warn(manifest: Manifest) -> None:
     """Print a stage's warnings."""
     for code, sentence in manifest.warnings:
-        console.note(f"Warning ({manifest.stage}): {sentence} ({code})", "yellow")
+        console.warn(f"Warning ({manifest.stage}): {sentence} ({code})")
 
 
 class Events(Listener):
@@ -166,6 +166,13 @@ class _Rate(ProgressColumn):
         return Text(_rate(speed) if speed else "", style="dim")
 
 
+class _TimeLeft(TimeRemainingColumn):
+    """Nothing, not dashes, until the time left is known: after the second unit."""
+
+    def render(self, task: Task) -> Text:
+        return Text("") if task.time_remaining is None else super().render(task)
+
+
 def _whole() -> Column:
     """A column that is never cut nor wrapped."""
     return Column(no_wrap=True)
@@ -181,7 +188,7 @@ class _Bar(Progress):
             BarColumn(bar_width=None, table_column=Column(ratio=1)),
             MofNCompleteColumn(table_column=_whole()),
             _Rate(table_column=_whole()),
-            TimeRemainingColumn(compact=True, table_column=_whole()),
+            _TimeLeft(compact=True, table_column=_whole()),
             console=console.err,
             transient=True,
             disable=disable,

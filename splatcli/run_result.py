@@ -69,9 +69,8 @@ def show(pipeline: Pipeline, until: str | None) -> None:
             progress.warn(manifest)
     if verdict:
         console.out.print()
-        whole = not console.out.is_terminal  # a terminal would break it inside of words
         text = Text(verdict["text"], style=_STYLES[verdict["grade"]])
-        console.out.print(text, soft_wrap=whole)
+        console.paragraph(console.out, text)
         console.out.print(f"Look at it: splat view {pipeline.run_folder}", markup=False)
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
+from rich.filesize import decimal
+
 # C0 without the line feed, DEL, C1, and the marks that change the direction of writing.
 _CONTROLS = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
 _NO_UTF8 = re.compile("[\udc80-\udcff]")  # bytes of file names, as Python writes them (PEP 383)
@@ -15,6 +17,11 @@ _ADVICE = re.compile(r"[;,] (?:use|see|set|try|consider|pass)\b.*", re.IGNORECAS
 def counted(count: int, noun: str, plural: str = "") -> str:
     """ "1 photograph", "3 photographs", "1,200 splats". plural: where adding an s is wrong."""
     return f"{count:,} {noun if count == 1 else plural or noun + 's'}"
+
+
+def size(count: float) -> str:
+    """Bytes as people read them: "1.3 MB"."""
+    return decimal(int(count))
 
 
 def listed(names: Sequence[str], most: int = 8) -> str:

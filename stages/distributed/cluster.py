@@ -20,6 +20,8 @@ from typing import Any
 
 from stages.base.distribution import VERSION, install_command
 from stages.base.errors import Family, Interrupted, ResourceError, SplatError, UsageError
+from stages.base.memory import MIB
+from stages.base.text import size
 from stages.distributed.remote import Location, is_seen
 from stages.distributed.tasks import (
     Executor,
@@ -97,8 +99,8 @@ class RayExecutor:
         if memory_mib > largest:
             raise ResourceError(
                 "cluster-too-small",
-                given=f"One task may take {memory_mib:,.0f} MiB, and no worker has more than "
-                f"{largest:,.0f}.",
+                given=f"One task may take {size(memory_mib * MIB)}, and no worker has more than "
+                f"{size(largest * MIB)}.",
                 wanted="A worker with memory for the splats and photographs of one run.",
                 hint="Ask for less: --max-splats, --train-side; or add a larger worker.",
             )

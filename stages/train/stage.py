@@ -19,8 +19,9 @@ import numpy as np
 from stages.base.atomic import replacing
 from stages.base.bad_files import reading, stage_output
 from stages.base.errors import QualityError, ResourceError, SplatError
+from stages.base.memory import MIB
 from stages.base.stage import Report
-from stages.base.text import counted
+from stages.base.text import counted, size
 from stages.evaluate.verdict import WRONG
 from stages.raster.backends import report_backend, unavailable_backends
 from stages.raster.definition import MemoryFull
@@ -168,8 +169,8 @@ def _report_cap(cap: Cap, densified: int, report: Report) -> None:
     if cap.origin == FREE_MEMORY and densified >= _AT_THE_CAP * cap.splats:
         report.warn(
             "train-splat-cap-reached",
-            f"Free memory ({cap.free_mib or 0:,.0f} MiB) limited training to {cap.splats:,} "
-            f"splats; 100,000 more take {memory_mib(100_000):,.0f} MiB.",
+            f"Free memory ({size((cap.free_mib or 0) * MIB)}) limited training to {cap.splats:,} "
+            f"splats; 100,000 more take {size(memory_mib(100_000) * MIB)}.",
         )
 
 

@@ -403,7 +403,7 @@ def test_a_run_goes_on_under_its_first_cap_whatever_memory_is_free_by_then(
     assert (figures["splat_cap"], figures["splat_cap_from"]) == (100, "free memory")
     assert figures["splat_cap_free_mib"] == 100
     assert warnings["train-splat-cap-reached"] == (
-        "Free memory (100 MiB) limited training to 100 splats; 100,000 more take 153 MiB."
+        "Free memory (104.9 MB) limited training to 100 splats; 100,000 more take 160.0 MB."
     )
     with pytest.raises((KilledError, Interrupted)):
         trained("broken", 100.0, stopping=True)

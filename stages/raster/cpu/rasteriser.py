@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from stages.base.errors import ResourceError, SplatError
 from stages.base.memory import MIB, available_mib
+from stages.base.text import size as size_text
 from stages.raster.camera_row import camera_row
 from stages.raster.cpu import binning, blend, contributions
 from stages.raster.cpu.projection import GEOMETRY_ROW
@@ -47,9 +48,9 @@ class Buffers:
         size = int(np.prod(shape))
         have = self._arrays.get(name)
         if have is None or have.size < size or have.dtype != np.dtype(dtype):
-            wanted_mib, free_mib = size * np.dtype(dtype).itemsize / MIB, available_mib()
-            if wanted_mib > free_mib:
-                raise MemoryError(f"{wanted_mib:,.0f} MiB wanted, {free_mib:,.0f} MiB free")
+            wanted, free = size * np.dtype(dtype).itemsize, available_mib() * MIB
+            if wanted > free:
+                raise MemoryError(f"{size_text(wanted)} wanted, {size_text(free)} free")
             have = np.empty(size + size // 8 + 16, dtype)
             self._arrays[name] = have
         return have[:size].reshape(shape)

@@ -20,6 +20,7 @@ from pkgutil import resolve_name
 from typing import Any
 
 from stages.base.errors import ResourceError
+from stages.base.text import size
 from stages.raster.definition import MemoryFull
 
 INSTALL = "docs/guide/gpu.md says which build of torch to install."
@@ -158,10 +159,10 @@ def describe() -> str:
     properties = torch.cuda.get_device_properties(0)
     runtime = torch.version.hip or torch.version.cuda
     kind = "ROCm" if torch.version.hip else "CUDA"
-    gib = properties.total_memory / 2**30
     driver = f"driver {_driver()}, " if _driver() else ""
     real = "" if float64_is_fast() else ", float32 footprints"
-    return f"{properties.name}, {gib:.0f} GiB, {driver}{kind} {runtime}, {built()}{real}"
+    name = f"{properties.name}, {size(properties.total_memory)}"
+    return f"{name}, {driver}{kind} {runtime}, {built()}{real}"
 
 
 def float64_is_fast() -> bool:
@@ -222,6 +223,5 @@ def out_of_memory(splats: int, free: int, held: int, total: int) -> MemoryFull:
     fits = splats // 2
     if total:
         fits = min(int(0.8 * splats), int(0.9 * (free + held) / BYTES_A_SPLAT))
-    gib = 2**30
-    room = f"{free / gib:.1f} of {total / gib:.1f} GiB free, {held / gib:.1f} GiB held by this run"
+    room = f"{size(free)} of {size(total)} free, {size(held)} held by this run"
     return MemoryFull(splats, fits, room)
