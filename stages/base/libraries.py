@@ -4,29 +4,23 @@ from __future__ import annotations
 
 import platform
 import re
-import tomllib
 from functools import cache
 from importlib.metadata import PackageNotFoundError, distribution, requires, version
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
 
 from stages.base.distribution import NAME, VERSION
-
-_PYPROJECT = Path(__file__).resolve().parents[2] / "pyproject.toml"
 
 
 def needed() -> tuple[str, ...]:
     """Names of the distributions that the project needs, without its extras. One that only some
     versions of Python or systems need is named where it is installed.
 
-    They come from the installed metadata, or from `pyproject.toml` in a checkout that was never
-    installed; () if there is neither.
+    They come from the installed metadata; () in a checkout that was never installed.
     """
     try:
         lines = requires(NAME) or []
     except PackageNotFoundError:
-        if not _PYPROJECT.is_file():
-            return ()
-        lines = tomllib.loads(_PYPROJECT.read_text(encoding="utf-8"))["project"]["dependencies"]
+        return ()
     always = [line for line in lines if not re.search(r"\bextra\s*==", line)]
     names = [re.split(r"[^\w.-]", line, maxsplit=1)[0] for line in always]
     both = zip(names, always, strict=True)

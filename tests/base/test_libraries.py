@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import tomllib
-from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 import pytest
@@ -35,17 +34,6 @@ def test_pyproject_names_the_distribution_as_the_code_does() -> None:
     assert project["project"]["dynamic"] == ["version"]
     version = project["tool"]["setuptools"]["dynamic"]["version"]
     assert version == {"attr": "stages.base.distribution.VERSION"}
-
-
-def test_a_checkout_that_is_not_installed_knows_its_dependencies(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def not_installed(name: str) -> list[str]:
-        raise PackageNotFoundError(name)
-
-    monkeypatch.setattr(libraries, "requires", not_installed)
-    monkeypatch.setattr(libraries, "_PYPROJECT", PYPROJECT)
-    assert list(libraries.needed()) == declared()
 
 
 def test_dependencies_are_read_less_extras_and_versions(monkeypatch: pytest.MonkeyPatch) -> None:
