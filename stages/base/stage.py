@@ -67,7 +67,7 @@ class Report:
     earlier: Earlier | None = None
 
     def metric(self, name: str, value: Any) -> None:
-        """Record one figure, JSON-serialisable, with the unit in its name (`train_seconds`)."""
+        """Record one figure, JSON-serialisable, with the unit in its name (`psnr_db`)."""
         self.metrics[name] = value
 
     def warn(self, code: str, message: str) -> None:

@@ -10,7 +10,6 @@
 from __future__ import annotations
 
 import shutil
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -99,7 +98,6 @@ class _BlockTraining:
 
     def train(self, blocks: int, seeds: Splats, folder: Path) -> TrainedSplats:
         """The merged splats, written to `folder` as training writes them."""
-        started = time.monotonic()
         light = corrects_light(self.whole, self.settings.light, self.report)
         if not light:
             views = tuple(replace(view, light=None) for view in self.whole.views)
@@ -129,7 +127,6 @@ class _BlockTraining:
         self.report.metric("training_views", len(training))
         self.report.metric("held_out_views", len(held))
         self.report.metric("views_across_blocks", [view.name for view in crossing])
-        self.report.metric("train_seconds", round(time.monotonic() - started, 1))
         return trained
 
     def _evaluate(self, splats: Splats, held: Sequence[View], folder: Path) -> Verdict:

@@ -303,7 +303,5 @@ def _report_capture(photos: tuple[Photo, ...], report: Report) -> None:
     report.metric("panoramas", sum(photo.face is not None for photo in photos))
     report.metric("with_focal_length", sum(photo.focal_px is not None for photo in photos))
     report.metric("masked", sum(bool(photo.mask) for photo in photos))
-    if any(photo.depth for photo in photos):
-        report.metric("with_depth", sum(bool(photo.depth) for photo in photos))
     report.metric("cameras", len({photo.camera for photo in photos}))
     report.metric("blurred", len(blurred))

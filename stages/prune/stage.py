@@ -173,7 +173,6 @@ def _report_result(before: Splats, found: PruningResult, report: Report) -> None
     report.metric("splats_by_sh_degree", degrees)
     cost_figures = asdict(cost) | {"bits_per_parameter": cost.bits_per_parameter}
     report.metric("rate_distortion", cost_figures)
-    report.metric("training_psnr_before_db", round(found.start_db, 3))
     report.metric("training_psnr_db", round(found.end_db, 3))
     report.metric("stopped_by", found.stopped_by)
     report.metric("rounds", [asdict(one) for one in found.rounds])

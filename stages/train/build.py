@@ -112,7 +112,6 @@ def corrects_light(reconstruction: Reconstruction, choice: str, report: Report) 
     motion found that the camera changed these, unless the `choice` is "off"."""
     spread = spread_ev(view.light for view in reconstruction.views)
     corrects = choice != "off" and spread > 0
-    report.metric("light_spread_ev", round(spread, 4))
     report.metric("light_corrected", corrects)
     if corrects:
         report.warn(

@@ -118,7 +118,6 @@ def write_history(history: History, folder: Path, report: Report) -> None:
 
 def _report_scores(by_size: Mapping[str, Sequence[Score]], report: Report) -> None:
     scores = by_size["full"]
-    values = [score.psnr_db for score in scores]
     worst = min(scores, key=lambda score: score.psnr_db)
     flips = [score.flip for score in scores if score.flip is not None]
     for name, same in by_size.items():
@@ -126,7 +125,6 @@ def _report_scores(by_size: Mapping[str, Sequence[Score]], report: Report) -> No
         report.metric(psnr_name(name), round(mean, 3))
     report.metric("psnr_worst_db", round(worst.psnr_db, 3))
     report.metric("psnr_worst_view", worst.name)
-    report.metric("psnr_spread_db", round(float(np.std(values)), 3))
     report.metric("ssim", round(float(np.mean([score.ssim for score in scores])), 4))
     if flips:
         report.metric("flip", round(float(np.mean(flips)), 4))

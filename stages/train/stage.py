@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import time
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -60,7 +59,6 @@ def run(
     """
     if settings.blocks != "1":
         raise ValueError("blocks are runs of their own: stages.distributed.blocks trains them")
-    started = time.monotonic()
     reconstruction: Reconstruction = inputs["sfm"]
     start: Splats = inputs["seed"]
     trainer = make_trainer(reconstruction, len(start), settings, folder, report)
@@ -99,7 +97,6 @@ def run(
             "better splats.",
         )
     _report_cap(trainer.cap, trainer.history.most_splats, report)
-    report.metric("train_seconds", round(time.monotonic() - started, 1))
     return trained
 
 
