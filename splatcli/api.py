@@ -41,7 +41,6 @@ class Options(TypedDict, total=False):
     frames: int
     seed: int
     max_features: int
-    matching: str
     features: str
     allow_partial: bool
     cameras: Path | None

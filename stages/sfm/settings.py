@@ -23,11 +23,6 @@ class SfmSettings:
     max_features: int = setting(
         12_288, "Approximate number of SIFT features in each photograph.", min=100, max=1_000_000
     )
-    matching: str = setting(
-        "auto",
-        "Pairs of photographs to match: auto (those with similar features) or exhaustive (all).",
-        choices=("auto", "exhaustive"),
-    )
     features: str = setting(
         "auto",
         "sift; auto (SIFT, and learned features where it leaves photographs out, if they are "

@@ -90,11 +90,10 @@ def _from_photographs(
     features = usable_features(settings.features, report)
     work = folder / _WORK
     project, sift = project_of(capture, work, settings.seed), Sift(settings.max_features)
-    prepare_work_folder(work, project, sift, settings.matching)
+    prepare_work_folder(work, project, sift)
     runner = attempt_runner.AttemptRunner(
         project,
         sift,
-        settings.matching,
         report,
         deadline=time.monotonic() + 60.0 * settings.max_minutes,
         allow_partial=settings.allow_partial,

@@ -43,7 +43,6 @@ class AttemptRunner:
     Args:
         project: of the standard configuration, in the work folder.
         sift: settings of the standard configuration, which others vary.
-        matching: the setting, which others override.
         report: receives progress, and says when to stop.
         deadline: of all configurations together, in seconds of `time.monotonic`.
         allow_partial: go on to mapping although the gates before it failed.
@@ -53,7 +52,6 @@ class AttemptRunner:
 
     project: Project
     sift: Sift
-    matching: str
     report: Report
     deadline: float
     allow_partial: bool = False
@@ -147,7 +145,7 @@ class AttemptRunner:
 
     def _with_matches(self, project: Project, configuration: Configuration) -> Project:
         """Match; returns the project with the database of the two-view geometries to use."""
-        how = "exhaustive" if configuration.more_features else self.matching
+        how = "exhaustive" if configuration.more_features else "auto"
         marker = project.database.with_suffix(f".{how}-done")
         if marker.exists() and project.database.exists():
             return project

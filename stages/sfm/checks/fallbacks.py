@@ -20,8 +20,7 @@ class Configuration:
 
     Args:
         name: for messages and metrics.
-        more_features: lower SIFT's peak threshold, allow more features, and match every pair,
-            whatever the settings say.
+        more_features: lower SIFT's peak threshold, allow more features, and match every pair.
         learned: add learned features and their matches to SIFT's.
         loose, strongest_start: as in `job.Mapping`.
         fixes: codes of the failures after which this configuration is tried.
