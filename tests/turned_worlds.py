@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.editing.transform import rotation_about
+from stages.raster.similarity import rotation_about
 from stages.scene import Reconstruction, Splats, View
 from stages.seed.axes import surface_rotations
 

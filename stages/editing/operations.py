@@ -16,14 +16,14 @@ from stages.base.atomic import partial_prefix
 from stages.base.errors import SplatError, UsageError
 from stages.base.row_slices import row_slices
 from stages.base.text import counted
-from stages.editing import expression, levels, regions, transform
+from stages.editing import expression, levels, regions
 from stages.editing.decimate import decimate
 from stages.editing.scene import EditedScene
 from stages.editing.syntax import OPERATIONS, ParsedOperation
-from stages.editing.transform import Similarity
 from stages.evaluate.floaters import isolated_splats, near_camera_floaters
 from stages.formats import Format
 from stages.formats.values import concatenate, drop_undrawable, select_rows
+from stages.raster.similarity import Similarity, rotation_about, rotation_to_up
 from stages.scene import Splats
 
 Operation = Callable[[EditedScene], EditedScene]
@@ -79,7 +79,7 @@ def _prepare(parsed: ParsedOperation, target: Path) -> Operation:
             return _transforming(Similarity(offset=_vector(parsed, value)))
         case "up":
             up = _direction(parsed, value)
-            return _transforming(Similarity(rotation=transform.rotation_to_up(up)))
+            return _transforming(Similarity(rotation=rotation_to_up(up)))
         case "merge":
             return _merging(Path(value))
         case "degree":
@@ -230,7 +230,7 @@ def _rotation(parsed: ParsedOperation) -> NDArray[np.float64]:
     angle = regions.parse_numbers(degrees, 1)
     if angle is None or abs(angle[0]) > _MOST_DEGREES:
         raise _wrong(parsed)
-    return transform.rotation_about(_direction(parsed, axis), float(angle[0]))
+    return rotation_about(_direction(parsed, axis), float(angle[0]))
 
 
 def _direction(parsed: ParsedOperation, text: str) -> NDArray[np.float64]:

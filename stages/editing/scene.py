@@ -8,11 +8,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.editing.transform import Similarity
 from stages.evaluate.contribution import Contributions, measure_contributions
 from stages.evaluate.evaluation import EvaluationView, mean_psnr_db
 from stages.formats.values import select_rows
 from stages.raster.backends import AUTO
+from stages.raster.similarity import Similarity
 from stages.scene import Camera, Splats, View
 
 _COMPARABLE = 0.9  # of the pictures: with less, the PSNR measures what was cut away

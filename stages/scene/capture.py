@@ -163,6 +163,8 @@ class Reconstruction:
         levelled: whether the up direction (-Y) was found from the cameras.
         contradicted: whether the matches of some photographs contradict the cameras, so that these
             are believed only if training can reproduce photographs that took no part in it.
+        file_from_world: [4, 4] similarity to the world of the file that the cameras came from; None
+            where they were estimated.
     """
 
     folder: Path
@@ -176,6 +178,7 @@ class Reconstruction:
     place: EarthPlace | None = None
     levelled: bool = False
     contradicted: bool = False
+    file_from_world: NDArray[np.float64] | None = None
 
     def __repr__(self) -> str:
         return f"Reconstruction({len(self.views)} views, {len(self.points):,} points)"

@@ -14,6 +14,7 @@ from stages.scene import Camera, Reconstruction, View
 from stages.scene.place import EarthPlace
 
 FILE_NAME = "reconstruction.json"
+_FILE_WORLD = "file_from_world"
 _INTRINSICS = ("fx", "fy", "cx", "cy")
 _ARRAYS = {"points": "<f8", "colours": "|u1", "errors_px": "<f8", "tracks": "<i4"}
 
@@ -32,6 +33,7 @@ def save_reconstruction(folder: Path, reconstruction: Reconstruction) -> None:
         "contradicted": reconstruction.contradicted,
         "origin": [float(value) for value in reconstruction.origin],
         **({} if reconstruction.place is None else {"place": reconstruction.place.to_json()}),
+        **_file_world(reconstruction),
         "points": len(reconstruction.points),
         "views": [_view_to_dict(view) for view in reconstruction.views],
     }
@@ -58,8 +60,18 @@ def load_reconstruction(folder: Path) -> Reconstruction:
             place=EarthPlace.from_json(data["place"]) if "place" in data else None,
             levelled=bool(data["levelled"]),
             contradicted=bool(data.get("contradicted", False)),
+            file_from_world=(
+                np.array(data[_FILE_WORLD], np.float64).reshape(4, 4)
+                if _FILE_WORLD in data
+                else None
+            ),
             **arrays,
         )
+
+
+def _file_world(reconstruction: Reconstruction) -> dict[str, Any]:
+    to_file = reconstruction.file_from_world
+    return {} if to_file is None else {_FILE_WORLD: to_file.tolist()}
 
 
 def _load_array(folder: Path, name: str, dtype: str) -> Any:

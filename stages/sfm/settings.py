@@ -94,7 +94,7 @@ class SfmSettings:
 
 STAGE = Stage(
     "sfm",
-    version=26,
+    version=27,
     reads=("ingest",),
     settings_type=SfmSettings,
     **in_module("stages.sfm.stage"),

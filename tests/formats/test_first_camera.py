@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from stages import formats
 from stages.base.errors import SplatError
 from stages.editing.operations import join
-from stages.editing.transform import Similarity, rotation_about
+from stages.raster.similarity import Similarity, rotation_about
 from stages.page.cameras import page_cameras
 from stages.scene import Camera, Splats, View, load_splats, look_at, save_splats
 from stages.scene.framing import first_camera

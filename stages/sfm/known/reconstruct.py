@@ -288,7 +288,7 @@ def _finish(
         points, cameras = scale.points(points), scale.cameras(cameras)
         world_from_new[:3, :3] = world_from_new[:3, :3] @ scale.turn.T / scale.metres
     report.metric("file_from_world", world_from_new.tolist())
-    return write_reconstruction(
+    done = write_reconstruction(
         folder,
         photos,
         cameras,
@@ -297,6 +297,7 @@ def _finish(
         levelled=levelled,
         metric=scale,
     )
+    return replace(done, file_from_world=world_from_new)
 
 
 def _levelling(

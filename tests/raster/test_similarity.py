@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from stages.editing.transform import Similarity, rotation_about, rotation_to_up
+from stages.raster.similarity import Similarity, rotation_about, rotation_to_up
 from stages.raster.definition import RasterSettings
 from stages.raster.reference import parameters_of, render_tensors
 from stages.scene import DrawSettings, Splats
