@@ -9,7 +9,8 @@ from typing import Any
 import typer
 
 from splatcli import console, options
-from stages.base.settings import Setting, changed, settings_of
+from stages.base.errors import UsageError
+from stages.base.settings import UNSET, Setting, changed, settings_of
 from stages.raster.backends import backend_of
 from stages.run.pipeline import Pipeline
 from stages.run.runfolder import is_run_folder
@@ -115,10 +116,20 @@ def combined(
     chosen = dict(base)
     if preset is not None and "train" in chosen:
         chosen["train"] = PRESETS[preset]
+    if given.get("splats") not in (None, UNSET) and "steps" not in given:
+        given = {**given, "steps": 0}
     new = {
         name: changed(settings, given if len(chosen) == 1 else options_of(name, given))
         for name, settings in chosen.items()
     }
+    train = new.get("train")
+    if train is not None and train.steps == 0 and train.splats is None:
+        raise UsageError(
+            "option-alone",
+            given="--steps 0 means nothing without --splats.",
+            wanted="Splats to start from, or steps that train some.",
+            hint="Give --steps, or --splats with what another program trained.",
+        )
     if "backend" in given:  # an error now, not after an hour of other work
         with_backend = [settings for settings in new.values() if hasattr(settings, "backend")]
         for name in {settings.backend for settings in with_backend}:

@@ -16,6 +16,7 @@ from stages.run import runfolder
 from stages.run.listener import Listener, Listeners
 from stages.run.pipeline import Pipeline
 from stages.run.stages import STAGE_NAMES
+from stages.seed.settings import check_given
 from stages.sfm.known.match_cameras import check_split
 from stages.viewer.live_training import LiveTraining
 from stages.viewer.server import open_in_browser
@@ -45,6 +46,8 @@ def process(
     sfm = settings["sfm"]
     if "cameras" in given and sfm.cameras:  # errors of the file now, before photographs are read
         check_split(read_cameras(sfm.cameras), sfm.split)
+    if "splats" in given and settings["seed"].splats:
+        check_given(settings["seed"].splats, has_cameras=sfm.cameras is not None)
     if is_known and console.mode.has_notes:
         console.note(run_settings.training_summary(settings["train"], given, preset))
     _run(pipeline, settings, view=view)

@@ -15,7 +15,7 @@ import numpy as np
 
 from stages.base.text import listed
 from stages.evaluate.evaluation import SIZES, EvaluationView
-from stages.raster.draw import renderer
+from stages.raster.draw import renderer, supersampled
 from stages.scene import Splats
 
 GOOD, USABLE, WRONG, UNKNOWN = "good", "usable", "wrong", "unknown"
@@ -52,8 +52,12 @@ class Verdict:
 
 
 def fits(splats: Splats, views: Sequence[EvaluationView], backend: str) -> list[Fit]:
-    """How well each of the views is drawn, at a quarter of its size."""
+    """How well each of the views is drawn, at a quarter of its size. Splats for plain drawing are
+    drawn at their own size and averaged: drawn small they are too large, which is no fault of the
+    capture."""
     draw = renderer(splats, backend=backend)
+    if not splats.draw_settings.antialias:
+        draw = supersampled(draw, splats.draw_settings.side)
     drawn = [(view, draw(view.camera)) for view in (v.scaled(SIZES["quarter"]) for v in views)]
     middles = []
     for view, rendering in drawn:

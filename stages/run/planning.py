@@ -15,7 +15,7 @@ from stages.run.request import Request, settings_to_data, why_again
 from stages.run.workspace import Layout
 
 PHOTOS = "photos"  # the input of a stage that reads no other
-MASKS, RIG_MASK, DEPTH = "masks", "rig_mask", "depth"
+MASKS, RIG_MASK, DEPTH, SPLATS = "masks", "rig_mask", "depth", "splats"
 _NAMED_AT_MOST = 3
 
 
@@ -126,7 +126,7 @@ class Planner:
                 if name == DEPTH:
                     files = depth_files.files_of(path)
                 else:
-                    files = [path] if name in (MASKS, RIG_MASK) else files_of(path)
+                    files = [path] if name in (MASKS, RIG_MASK, SPLATS) else files_of(path)
             except SplatError as error:
                 # a folder that lost the files that made it one of cameras
                 if name not in known or error.code != "cameras-unknown":

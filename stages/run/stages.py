@@ -22,6 +22,7 @@ SHARED_OPTIONS = {
     "seed": ("sfm", "train"),  # of every random choice
     "allow_partial": ("sfm", "prune"),  # use what failed a check
     "max_splats": ("train",),  # what `prune` is given by itself is a target, whatever the loss
+    "splats": ("seed", "train"),  # brought into the run's world, and trained from
     "seconds": ("train", "prune"),  # divided among them, see `pipeline.within_limit`
     "formats": ("quantise", "export"),  # what is fine-tuned to, and what is written
     "drawing": ("train", "quantise", "export"),  # trained for, fine-tuned for, and written for it

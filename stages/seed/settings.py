@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
+from stages.base.bad_files import reading
+from stages.base.errors import UsageError
 from stages.base.settings import setting
 from stages.base.stage import Stage, in_module
+from stages.formats.format_table import format_of
 
 
 @dataclass(frozen=True)
 class SeedSettings:
     """Settings of the initial splats."""
 
+    splats: Path | None = setting(
+        None,
+        "Splats that another program trained with --cameras, in any format that is read: they take "
+        "the place of the first splats, and are not trained unless --steps asks for it.",
+        panel="Input",
+        affects_output=False,  # its content does, and that is an input
+    )
     fill: bool = setting(True, "Add splats where photographs show surfaces without points.")
 
 
@@ -22,3 +33,18 @@ STAGE = Stage(
     settings_type=SeedSettings,
     **in_module("stages.seed.stage"),
 )
+
+
+def check_given(path: Path, has_cameras: bool) -> None:
+    """Raise SplatError for `--splats` that no run could use: "splats-unreadable" for a file that is
+    not there, as `format_of`, and "seed-splats-without-cameras"."""
+    with reading(path):
+        format_of(path)
+    if not has_cameras:
+        raise UsageError(
+            "seed-splats-without-cameras",
+            given=f"The splats of {path} are in the world of the cameras that they were trained "
+            "with, and this run would estimate its own.",
+            wanted="The cameras of the program that trained the splats.",
+            hint="Add --cameras with the COLMAP model or transforms.json that it was given.",
+        )

@@ -1,4 +1,5 @@
-"""Stage 3: Reconstruction -> Splats: initial splats at sparse points, and where there are none.
+"""Stage 3: Reconstruction -> Splats: initial splats at sparse points, and where there are none, or
+the `given` ones of another program.
 
 Follows the reference trainer (Kerbl et al., 3D Gaussian Splatting, 2023, section 5.1): one round
 splat a point, as large as the mean distance to its three nearest neighbours, opacity 0.1. Its axes
@@ -30,6 +31,7 @@ from stages.scene.capture import geometric_median
 from stages.scene.storage import load_splats, save_splats
 from stages.seed.axes import surface_rotations
 from stages.seed.empty_cells import fill_cells
+from stages.seed.given import given_splats
 from stages.seed.measured_depth import measured_points
 from stages.seed.neighbours import mean_neighbour_distance, nearest_distance
 from stages.seed.plane_sweep import plane_sweep_points
@@ -48,11 +50,28 @@ _LARGEST_SCALE = 0.05  # x the distance to the nearest camera: 3 degrees to eith
 
 
 def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report: Report) -> Splats:
-    """Splats of SH degree 0 from inputs["sfm"], written to `folder`.
+    """Splats of inputs["sfm"], written to `folder`.
 
-    Raises SplatError "seed-too-few-points" if fewer than 50 points are usable.
+    Raises SplatError "seed-too-few-points" if fewer than 50 points are usable, and as
+    `given_splats`.
     """
     reconstruction: Reconstruction = inputs["sfm"]
+    if settings.splats is not None:
+        splats = given_splats(settings.splats, reconstruction, report)
+    else:
+        splats = _initial(reconstruction, settings, report)
+    save_splats(folder, splats)
+    report.metric("splats", len(splats))
+    return splats
+
+
+def load(folder: Path) -> Splats:
+    """The splats of a finished folder."""
+    return load_splats(folder)
+
+
+def _initial(reconstruction: Reconstruction, settings: SeedSettings, report: Report) -> Splats:
+    """Splats of SH degree 0 at points and where there are none."""
     keep = _usable(reconstruction, report)
     points = reconstruction.points[keep]
     if len(points) < _FEWEST_SPLATS:
@@ -74,7 +93,7 @@ def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report:
         points, colours = np.concatenate([points, more]), np.concatenate([colours, more_colours])
         scales = np.concatenate([scales, more_scales])
     report.progress(1, 1, "seeding", splats=len(points))
-    splats = Splats(
+    return Splats(
         means=points.astype(np.float32),
         quaternions=surface_rotations(points, cameras).astype(np.float32),
         log_scales=np.repeat(np.log(scales)[:, None], 3, axis=1).astype(np.float32),
@@ -84,14 +103,6 @@ def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report:
         origin=reconstruction.origin.copy(),
         draw_settings=draw_settings_of(reconstruction.views),
     )
-    save_splats(folder, splats)
-    report.metric("splats", len(splats))
-    return splats
-
-
-def load(folder: Path) -> Splats:
-    """The splats of a finished folder."""
-    return load_splats(folder)
 
 
 def _usable(reconstruction: Reconstruction, report: Report) -> NDArray[np.bool_]:

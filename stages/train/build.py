@@ -9,11 +9,11 @@ from stages.base.stage import Report
 from stages.base.text import counted
 from stages.evaluate.evaluation import load_evaluation_views
 from stages.raster.backends import backend_of
-from stages.scene import Reconstruction, draw_settings_of, split_held_out, training_extent
+from stages.scene import Reconstruction, Splats, draw_settings_of, split_held_out, training_extent
 from stages.scene.light import spread_ev
 from stages.train.camera_refinement import CameraRefinement
 from stages.train.cap import cap_for, splats_determined
-from stages.train.schedule import Schedule
+from stages.train.schedule import LAST_PART, Schedule
 from stages.train.settings import TrainSettings
 from stages.train.trainer import Trainer, TrainingTask
 from stages.train.views import load_views
@@ -21,24 +21,28 @@ from stages.train.views import load_views
 
 def make_trainer(
     reconstruction: Reconstruction,
-    n_start: int,
+    start: Splats,
     settings: TrainSettings,
     folder: Path,
     report: Report,
 ) -> Trainer:
-    """Load the training views and choose the cap of splats. n_start: splats at the start. Raises
-    SplatError."""
+    """Load the training views and choose the cap of splats. Raises SplatError.
+
+    start: what another program trained keeps its SH degree, its drawing and all its splats, and
+    gets the last part of a run.
+    """
     began = time.monotonic()
     kept, held = split_held_out(reconstruction.views)
     light = corrects_light(reconstruction, settings.light, report)
     train = load_views(reconstruction.folder, kept, settings.train_side, folder, light)
-    draw_settings = draw_settings_of(
-        reconstruction.views, settings.train_side, light, settings.antialias
-    )
+    given = settings.splats is not None
+    antialias = start.draw_settings.antialias if given else settings.antialias
+    sh_degree = start.sh_degree if given else settings.sh_degree
+    draw_settings = draw_settings_of(reconstruction.views, settings.train_side, light, antialias)
     held_out = load_evaluation_views(reconstruction.folder, held, draw_settings)
     _warn_of_small_photographs(reconstruction, settings.train_side, report)
-    determined = splats_determined([view.levels[-1].camera for view in train], settings.sh_degree)
-    cap = cap_for(folder, settings.max_splats, determined)
+    determined = splats_determined([view.levels[-1].camera for view in train], sh_degree)
+    cap = cap_for(folder, len(start) if given else settings.max_splats, determined)
     report.metric("splat_cap_free_mib", cap.free_mib)
     extent, backend = training_extent(reconstruction), settings.backend
     refinement = None
@@ -63,9 +67,10 @@ def make_trainer(
     schedule = Schedule(
         steps=_limited_steps(settings, len(train), report),
         extent=extent,
-        sh_degree=settings.sh_degree,
-        n_start=min(n_start, cap.splats),
+        sh_degree=sh_degree,
+        n_start=min(len(start), cap.splats),
         seed=settings.seed,
+        since=LAST_PART if given else (0, 0.0),
     )
     return Trainer(task, schedule, cap, refinement)
 

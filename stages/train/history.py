@@ -64,4 +64,4 @@ class History:
     @property
     def most_splats(self) -> int:
         """The largest number of splats at an evaluation."""
-        return max(entry.splats for entry in self.entries)
+        return max((entry.splats for entry in self.entries), default=0)

@@ -25,6 +25,7 @@ RATES_POWER = 0.6  # all, but that of the means at the end
 MEANS_END_POWER = 1.2
 # Learning rates decay from this share of the run on, to this share of their value.
 RATE_DECAY_FROM, RATE_DECAY_END = 0.6, 0.1
+LAST_PART = (0, RATE_DECAY_FROM)  # `Schedule.since` of a run that starts from trained splats
 MIN_DENSIFY_INTERVAL = 50  # steps: fewer see too little of the scene
 SCALES = (0.25, 0.5, 1.0)  # of the images' sides
 QUARTER, HALF, FULL = range(len(SCALES))
@@ -61,8 +62,6 @@ class Schedule:
     def share(self, step: int) -> float:
         """Share of the run that is done before `step`, 0 to 1."""
         from_step, from_share = self.since
-        if from_step == 0:
-            return step / self.steps
         return from_share + (1.0 - from_share) * (step - from_step) / (self.steps - from_step)
 
     def passes(self, step: int, parts: int) -> bool:

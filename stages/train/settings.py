@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from stages.base.settings import setting
 from stages.base.stage import Stage, in_module
@@ -15,9 +16,9 @@ from stages.raster.backends import backend_setting
 class TrainSettings:
     steps: int = setting(
         7000,
-        "Training steps, with one photograph each.",
+        "Training steps, with one photograph each; 0, the default of --splats: none.",
         panel="Quality and time",
-        min=1,
+        min=0,
         max=1_000_000,
     )
     steps_per_view: int = setting(
@@ -95,6 +96,12 @@ class TrainSettings:
         max=1e30,
     )
     backend: str = backend_setting()
+    splats: Path | None = setting(
+        None,
+        "The splats of `splat seed` are those of this file of another program: only the last part "
+        "of a training is made.",
+        affects_output=False,  # its content does, and that is an input
+    )
 
     @property
     def antialias(self) -> bool:

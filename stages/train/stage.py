@@ -61,14 +61,14 @@ def run(
         raise ValueError("blocks are runs of their own: stages.distributed.blocks trains them")
     reconstruction: Reconstruction = inputs["sfm"]
     start: Splats = inputs["seed"]
-    trainer = make_trainer(reconstruction, len(start), settings, folder, report)
+    trainer = make_trainer(reconstruction, start, settings, folder, report)
     task = trainer.task
     _report_task(task, settings, report)
     try:
         model = train(trainer, start)
     except MemoryFull as full:
         raise _does_not_fit(full, lower_cap(folder, full.fits).splats) from full
-    splats = splats_of(model, settings.sh_degree, start, task.draw_settings)
+    splats = splats_of(model, trainer.schedule.sh_degree, start, task.draw_settings)
     if settings.smooth:
         splats = smoothed(splats, trainer.smoothing_widths(splats.means))
     if len(splats) == 0:
@@ -125,6 +125,13 @@ def _report_task(task: TrainingTask, settings: TrainSettings, report: Report) ->
     report_backend(report, task.backend)
     report.metric("device", report.device)
     report.metric("unavailable_backends", unavailable_backends(settings.backend))
+    if settings.splats is not None:
+        report.warn(
+            "train-held-out-unknown",
+            "The given splats may have been trained on the photographs that are held out here: "
+            "their PSNR is then no measure of other views. Every eighth by name is held out, as in "
+            "the papers, or the test photographs of --cameras with --split.",
+        )
     report.metric("training_views", len(task.views))
     report.metric("held_out_views", len(task.held_out))
 

@@ -134,7 +134,7 @@ def _coincident_training(backend):
         settings = TrainSettings(
             steps=steps, train_side=36, sh_degree=1, max_splats=100, backend=backend
         )
-        trainer = build.make_trainer(reconstruction, 40, settings, folder, Report())
+        trainer = build.make_trainer(reconstruction, scene.splats, settings, folder, Report())
         model = train_all(trainer, scene.splats)
         degenerate = int(not 0 < scene_extent(views) < np.inf)
         removed = 1 - len(model) / len(scene.splats)  # sparsification takes a third

@@ -130,7 +130,7 @@ def _trained(backend, steps, threads):
             backend=backend,
         )
         start = scene.splats.take(np.arange(0, 80, 2)).with_sh_degree(0)
-        trainer = build.make_trainer(scene.reconstruction, len(start), settings, folder, Report())
+        trainer = build.make_trainer(scene.reconstruction, start, settings, folder, Report())
         if backend == "cpu":
             trainer.stepper = CpuStep(CpuRasteriser(Pool(threads)))
         model = train_all(trainer, start)

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from stages import formats
 from stages.base.errors import SplatError
 from stages.editing.operations import join
-from stages.raster.similarity import Similarity, rotation_about
 from stages.page.cameras import page_cameras
+from stages.raster.similarity import Similarity, rotation_about
 from stages.scene import Camera, Splats, View, load_splats, look_at, save_splats
 from stages.scene.framing import first_camera
 from stages.viewer.render_cameras import camera_of_view

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from stages.raster.similarity import Similarity, rotation_about, rotation_to_up
 from stages.raster.definition import RasterSettings
 from stages.raster.reference import parameters_of, render_tensors
+from stages.raster.similarity import Similarity, rotation_about, rotation_to_up
 from stages.scene import DrawSettings, Splats
 from tests import scenes
 

@@ -69,7 +69,7 @@ def test_a_time_limit_plans_no_more_steps_than_the_training_views_allow():
 def test_each_training_view_takes_a_bounded_number_of_steps(tmp_path, steps, per_view, wanted):
     scene, report = small_scene(tmp_path, views=5), Report()  # one of them is held out
     settings = TrainSettings(steps=steps, steps_per_view=per_view, max_splats=100)
-    made = make_trainer(scene.reconstruction, 50, settings, tmp_path, report)
+    made = make_trainer(scene.reconstruction, scene.splats, settings, tmp_path, report)
     assert made.schedule.steps == wanted
     limited = [text for code, text in report.warnings if code == "train-steps-limited"]
     assert len(limited) == (wanted < steps)

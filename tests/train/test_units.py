@@ -56,10 +56,15 @@ def test_a_run_ends_with_the_same_picture_in_any_unit(sample_run: Path, tmp_path
 
 def test_dropout_is_decided_by_the_number_of_views_alone(tmp_path: Path) -> None:
     for views in (16, 18):  # of which 2 and 3 are held out
-        made = small_scene(tmp_path, views).reconstruction
+        scene = small_scene(tmp_path, views)
+        made = scene.reconstruction
         decisions = [
             make_trainer(
-                in_units(made, scale), 100, TrainSettings(max_splats=100), tmp_path, Report()
+                in_units(made, scale),
+                scene.splats,
+                TrainSettings(max_splats=100),
+                tmp_path,
+                Report(),
             ).task.dropout
             for scale in (1.0, 0.999, 1e-6, 1e6)
         ]

@@ -1,0 +1,142 @@
+"""Splats of other programs: brought into the run's world, and read as they were trained."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from stages import formats
+from stages.base.errors import SplatError
+from stages.base.stage import Report
+from stages.raster.draw import render
+from stages.raster.similarity import Similarity, rotation_about
+from stages.scene import DrawSettings, Splats
+from stages.seed import stage
+from stages.seed.given import NERFSTUDIO, given_splats
+from stages.seed.settings import SeedSettings
+from tests.small_scene import SmallScene, small_scene
+
+TO_FILE = Similarity(2.5, rotation_about(np.array([1.0, 2.0, 0.5]), 70), np.array([3.0, -8.0, 1.0]))
+HALF_TURN = Similarity(rotation=np.diag([1.0, -1.0, -1.0]))
+
+
+def matrix(similarity: Similarity) -> np.ndarray:
+    return np.linalg.inv(similarity.inverse_matrix)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> SmallScene:
+    """Its cameras came from a file whose world is another."""
+    made = small_scene(tmp_path)
+    world = replace(made.reconstruction, file_from_world=matrix(TO_FILE))
+    return SmallScene(made.splats, world)
+
+
+def written(folder: Path, splats: Splats, moved: Similarity) -> Path:
+    path = folder / "other" / "point_cloud.ply"
+    path.parent.mkdir()
+    formats.write(path, moved.apply_to_splats(splats))
+    return path
+
+
+def check_same(found: Splats, splats: Splats) -> None:
+    """The pictures are the test of rotations and of colours that depend on the view."""
+    np.testing.assert_allclose(found.means, splats.means, atol=2e-5)
+    np.testing.assert_allclose(found.log_scales, splats.log_scales, atol=1e-4)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_the_worlds_of_the_file_and_of_the_cameras_become_the_runs(
+    scene: SmallScene, tmp_path: Path, turned: bool
+) -> None:
+    moved = HALF_TURN.after(TO_FILE) if turned else TO_FILE
+    path, report = written(tmp_path, scene.splats, moved), Report()
+    found = given_splats(path, scene.reconstruction, report)
+    check_same(found, scene.splats)
+    np.testing.assert_array_equal(found.origin, scene.reconstruction.origin)
+    turning = " turned over" if turned else ""
+    assert report.metrics["reading"] == f"the cameras' world{turning}, plain drawing"
+    assert report.metrics["reading_db"] > report.metrics["next_reading_db"]
+    for view in scene.reconstruction.views[:3]:
+        drawn, true = (render(each, view.camera).image for each in (found, scene.splats))
+        assert np.abs(drawn - true).max() < 1e-3
+
+
+def test_splats_that_were_trained_for_antialiased_drawing_are_drawn_so(
+    scene: SmallScene, tmp_path: Path
+) -> None:
+    fine = replace(
+        scene.splats,
+        log_scales=scene.splats.log_scales - 1.5,
+        draw_settings=DrawSettings(antialias=True),
+    )
+    for view in scene.reconstruction.views:
+        image = np.clip(render(fine, view.camera).image, 0, 1)
+        Image.fromarray(np.uint8(image * 255 + 0.5)).save(tmp_path / view.image)
+    path, report = written(tmp_path, fine, TO_FILE), Report()
+    assert given_splats(path, scene.reconstruction, report).draw_settings.antialias
+    assert report.metrics["reading"] == "the cameras' world, antialiased drawing"
+
+
+def test_nerfstudios_normalised_world_is_read_from_beside_the_splats(
+    scene: SmallScene, tmp_path: Path
+) -> None:
+    normalised = Similarity(0.31, rotation_about(np.array([0, 1.0, 1.0]), 200), np.ones(3))
+    path = written(tmp_path, scene.splats, normalised.after(TO_FILE))
+    transform = matrix(normalised)[:3] / 0.31
+    data = {"transform": transform.tolist(), "scale": 0.31}
+    (path.parent / NERFSTUDIO).write_text(json.dumps(data))
+    report = Report()
+    check_same(given_splats(path, scene.reconstruction, report), scene.splats)
+    assert "nerfstudio" in report.metrics["reading"]
+    (path.parent / NERFSTUDIO).write_text('{"transform": [1, 2], "scale": 1}')
+    with pytest.raises(SplatError) as caught:
+        given_splats(path, scene.reconstruction, Report())
+    assert caught.value.code == "splats-unreadable"
+    assert NERFSTUDIO in caught.value.given
+
+
+def test_splats_of_another_scene_are_refused_with_both_figures(
+    scene: SmallScene, tmp_path: Path
+) -> None:
+    far = Similarity(1.0, np.eye(3), np.array([0.0, 40.0, 0.0]))
+    path = written(tmp_path, scene.splats, far.after(TO_FILE))
+    settings = SeedSettings(splats=path)
+    with pytest.raises(SplatError) as caught:
+        stage.run({"sfm": scene.reconstruction}, settings, tmp_path, Report())
+    assert caught.value.code == "seed-splats-do-not-fit"
+    assert caught.value.given.count(" dB") == 2
+    assert not (tmp_path / "splats.bin").exists()
+
+
+def test_splats_need_the_cameras_that_they_were_trained_with(
+    scene: SmallScene, tmp_path: Path
+) -> None:
+    path = written(tmp_path, scene.splats, TO_FILE)
+    own = replace(scene.reconstruction, file_from_world=None)
+    for reconstruction, file, code in (
+        (own, path, "seed-splats-without-cameras"),
+        (scene.reconstruction, tmp_path / "none.ply", "splats-unreadable"),
+        (scene.reconstruction, tmp_path / "00.png", "format-unknown"),
+    ):
+        with pytest.raises(SplatError) as caught:
+            given_splats(file, reconstruction, Report())
+        assert caught.value.code == code
+        assert str(file) in caught.value.given
+
+
+def test_what_cannot_be_drawn_is_left_out_and_said(scene: SmallScene, tmp_path: Path) -> None:
+    path = written(tmp_path, scene.splats, TO_FILE)
+    data = bytearray(path.read_bytes())
+    start = data.index(b"end_header\n") + len(b"end_header\n")
+    data[start : start + 4] = np.float32(np.nan).tobytes()
+    path.write_bytes(data)
+    report = Report()
+    found = given_splats(path, scene.reconstruction, report)
+    assert len(found) == len(scene.splats) - 1
+    assert [code for code, _ in report.warnings] == ["seed-splats-dropped"]
