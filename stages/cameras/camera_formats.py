@@ -23,6 +23,7 @@ from stages.cameras import (
     blender,
     bundler,
     colmap,
+    inria,
     llff,
     metashape,
     nerfstudio,
@@ -58,6 +59,9 @@ def _suffixed(suffix: str) -> Callable[[Path], Path | None]:
 
 
 CAMERA_FILES = (
+    CameraFormat(
+        "cameras.json of the reference 3DGS trainer", inria.locate, inria.read, inria.read_points
+    ),
     CameraFormat(
         "OpenSfM's and ODM's reconstruction.json", opensfm.locate, opensfm.read, opensfm.read_points
     ),

@@ -123,7 +123,7 @@ def read_points(path: Path) -> FilePoints | None:
     if file is None:
         return None
     with reading(file, CAMERAS):
-        points, colours = _ply_points(file)
+        points, colours = ply_points(file)
         turn, shift, scale = _applied(data)
         return file_points((points / scale - shift) @ turn, colours)
 
@@ -292,7 +292,7 @@ def _write_points(path: Path, points: NDArray[np.float64], colours: NDArray[np.u
         PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(partial))
 
 
-def _ply_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8] | None]:
+def ply_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8] | None]:
     """Positions [P, 3], and colours [P, 3] or None."""
     with path.open("rb") as file:
         header = read_header(file)

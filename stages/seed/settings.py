@@ -20,7 +20,7 @@ class SeedSettings:
         None,
         "Splats that another program trained with --cameras, in any format that is read: they take "
         "the place of the first splats, and are not trained unless --steps asks for it.",
-        panel="Input",
+        panel="Known cameras",
         affects_output=False,  # its content does, and that is an input
     )
     fill: bool = setting(True, "Add splats where photographs show surfaces without points.")

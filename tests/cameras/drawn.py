@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
+from plyfile import PlyData, PlyElement
 
 from stages.scene import look_at
 
@@ -139,6 +140,42 @@ def llff(folder: Path) -> Path:
     draw(folder / "images", projects)
     np.save(folder / "poses_bounds.npy", np.array(rows))
     return folder
+
+
+def inria(folder: Path) -> Path:
+    """The reference trainer's: camera to world, a pinhole."""
+    entries, projects = [], []
+    for number, (name, pose) in enumerate(zip(NAMES, POSES, strict=True)):
+        to_world = np.linalg.inv(pose)
+
+        def project(
+            points: NDArray[np.float64], to_world: NDArray = to_world
+        ) -> NDArray[np.float64]:
+            at = (points - to_world[:3, 3]) @ to_world[:3, :3]
+            return FOCAL * at[:, :2] / at[:, 2:] + (WIDTH / 2, HEIGHT / 2)
+
+        projects.append(project)
+        entries.append(
+            {
+                "id": number,
+                "img_name": name,
+                "width": WIDTH,
+                "height": HEIGHT,
+                "position": to_world[:3, 3].tolist(),
+                "rotation": to_world[:3, :3].tolist(),
+                "fy": FOCAL,
+                "fx": FOCAL,
+            }
+        )
+    draw(folder / "images", projects)
+    (folder / "cameras.json").write_text(json.dumps(entries))
+    channels = ("red", "green", "blue")
+    kinds = [*((axis, "<f8") for axis in "xyz"), *((channel, "u1") for channel in channels)]
+    rows = np.empty(len(POINTS), kinds)
+    for name, values in zip(("x", "y", "z", *channels), (*POINTS.T, *COLOURS.T), strict=True):
+        rows[name] = values
+    PlyData([PlyElement.describe(rows, "vertex")]).write(str(folder / "input.ply"))
+    return folder / "cameras.json"
 
 
 def opensfm(folder: Path) -> Path:
@@ -274,6 +311,7 @@ MADE = {
     "nerfstudio": nerfstudio,
     "blender": blender,
     "llff": llff,
+    "inria": inria,
     "opensfm": opensfm,
     "bundler": bundler,
 }

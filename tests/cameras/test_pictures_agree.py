@@ -55,7 +55,7 @@ def test_points_are_where_the_pictures_show_them(tmp_path: Path, name: str) -> N
         assert np.mean(hit) >= 0.8  # discs may cover each other
 
 
-@pytest.mark.parametrize("name", ["colmap", "opensfm", "bundler"])
+@pytest.mark.parametrize("name", ["colmap", "opensfm", "bundler", "inria"])
 def test_points_of_the_file_are_in_the_cameras_world(tmp_path: Path, name: str) -> None:
     found = read_points(MADE[name](tmp_path))
     assert found is not None
@@ -119,6 +119,7 @@ def _cut(path: Path) -> None:
         ("blender", "transforms_test.json"),
         ("llff", "poses_bounds.npy"),
         ("opensfm", "reconstruction.json"),
+        ("inria", "cameras.json"),
         ("bundler", "bundle.out"),
         ("metashape", "cameras.xml"),
         ("realityscan", "cameras.csv"),

@@ -33,7 +33,8 @@ def matrix(similarity: Similarity) -> np.ndarray:
 def scene(tmp_path: Path) -> SmallScene:
     """Its cameras came from a file whose world is another."""
     made = small_scene(tmp_path)
-    world = replace(made.reconstruction, file_from_world=matrix(TO_FILE))
+    points = made.splats.means.astype(np.float64) * (1.0, 0.7, 0.4)
+    world = replace(made.reconstruction, file_from_world=matrix(TO_FILE), points=points)
     return SmallScene(made.splats, world)
 
 
@@ -59,9 +60,11 @@ def test_the_worlds_of_the_file_and_of_the_cameras_become_the_runs(
     found = given_splats(path, scene.reconstruction, report)
     check_same(found, scene.splats)
     np.testing.assert_array_equal(found.origin, scene.reconstruction.origin)
-    turning = " turned over" if turned else ""
-    assert report.metrics["reading"] == f"the cameras' world{turning}, plain drawing"
-    assert report.metrics["reading_db"] > report.metrics["next_reading_db"]
+    turning = ", turned over" if turned else ""
+    assert report.metrics["given_world"] == f"the cameras' world{turning}"
+    assert report.metrics["given_world_db"] > report.metrics["next_world_db"]
+    assert report.metrics["given_drawing"] == "plain"
+    assert report.metrics["given_drawing_db"] > report.metrics["other_drawing_db"]
     for view in scene.reconstruction.views[:3]:
         drawn, true = (render(each, view.camera).image for each in (found, scene.splats))
         assert np.abs(drawn - true).max() < 1e-3
@@ -80,7 +83,7 @@ def test_splats_that_were_trained_for_antialiased_drawing_are_drawn_so(
         Image.fromarray(np.uint8(image * 255 + 0.5)).save(tmp_path / view.image)
     path, report = written(tmp_path, fine, TO_FILE), Report()
     assert given_splats(path, scene.reconstruction, report).draw_settings.antialias
-    assert report.metrics["reading"] == "the cameras' world, antialiased drawing"
+    assert report.metrics["given_drawing"] == "antialiased"
 
 
 def test_nerfstudios_normalised_world_is_read_from_beside_the_splats(
@@ -93,12 +96,40 @@ def test_nerfstudios_normalised_world_is_read_from_beside_the_splats(
     (path.parent / NERFSTUDIO).write_text(json.dumps(data))
     report = Report()
     check_same(given_splats(path, scene.reconstruction, report), scene.splats)
-    assert "nerfstudio" in report.metrics["reading"]
+    assert "nerfstudio" in report.metrics["given_world"]
     (path.parent / NERFSTUDIO).write_text('{"transform": [1, 2], "scale": 1}')
     with pytest.raises(SplatError) as caught:
         given_splats(path, scene.reconstruction, Report())
     assert caught.value.code == "splats-unreadable"
     assert NERFSTUDIO in caught.value.given
+
+
+def test_the_world_that_gsplat_normalises_to_is_found(scene: SmallScene, tmp_path: Path) -> None:
+    """By the formulas of its examples/datasets/normalize.py, written out with matrices."""
+    to_file = scene.reconstruction.file_from_world
+    assert to_file is not None
+    cameras = [np.linalg.inv(v.camera.world_to_camera) for v in scene.reconstruction.views]
+    poses = np.array([to_file @ pose for pose in cameras])
+    axes, centres = poses[:, :3, :3] / np.cbrt(np.linalg.det(to_file[:3, :3])), poses[:, :3, 3]
+    up = -axes[:, :, 1].mean(0) / np.linalg.norm(axes[:, :, 1].mean(0))
+    across = np.cross(up, [0, -1, 0])
+    turn = rotation_about(across, np.degrees(np.arccos(-up[1])))
+    np.testing.assert_allclose(turn @ up, [0, -1, 0], atol=1e-12)
+    at, ahead = centres @ turn.T, axes[:, :, 2] @ turn.T
+    middle = np.median([p - (p @ a) * a for p, a in zip(at, ahead, strict=True)], axis=0)
+    scale = 1 / np.median(np.linalg.norm(at - middle, axis=1))
+    first = Similarity(scale, turn, -scale * middle)
+    ones = np.ones((len(scene.reconstruction.points), 1))
+    points = np.hstack([scene.reconstruction.points, ones]) @ (matrix(first) @ to_file)[:3].T
+    values, vectors = np.linalg.eigh(np.cov(points.T))
+    assert values[0] < values[1] < values[2]
+    rotation = vectors[:, ::-1].T
+    rotation[1] *= np.sign(np.linalg.det(rotation))
+    second = Similarity(1.0, rotation, -rotation @ np.median(points, axis=0))
+    moved = second.after(first).after(TO_FILE)
+    path, report = written(tmp_path, scene.splats, moved), Report()
+    check_same(given_splats(path, scene.reconstruction, report), scene.splats)
+    assert report.metrics["given_world"] == "gsplat's normalised world"
 
 
 def test_splats_of_another_scene_are_refused_with_both_figures(
