@@ -51,6 +51,7 @@ class Options(TypedDict, total=False):
     marker: float
     crs: str
     max_minutes: float
+    splats: Path | None
     fill: bool
     steps: int
     steps_per_view: int

@@ -1,5 +1,5 @@
 """cameras.json of the reference trainer of 3D Gaussian splatting and of programs that grew from it:
-https://github.com/graphdeco-inria/gaussian-splatting (utils/camera_utils.py)
+https://github.com/graphdeco-inria/gaussian-splatting
 
 A list with one entry for each photograph: the camera's position, its axes as the columns of
 `rotation` (camera to world, our axes), and focal lengths in pixels of `width` x `height`. The

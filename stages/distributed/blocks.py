@@ -317,10 +317,12 @@ def _check(settings: TrainSettings) -> None:
             wanted="A maximum that the blocks can share: the free memory limits only one block.",
             hint="Give --max-splats, for example 250000 for each block.",
         )
-    if settings.seconds or settings.within or settings.refine_in_training:
+    unfit = settings.seconds, settings.within, settings.refine_in_training, settings.splats
+    if any(unfit):
         raise UsageError(
             "blocks-without-end",
-            given="--blocks cannot be combined with --seconds, --within or --refine-in-training.",
+            given="--blocks cannot be combined with --seconds, --within, --refine-in-training or "
+            "--splats.",
             wanted="Steps, which each block makes: --steps.",
-            hint="Leave --seconds, --within and --refine-in-training away.",
+            hint="Leave --seconds, --within, --refine-in-training and --splats away.",
         )

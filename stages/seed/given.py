@@ -123,6 +123,7 @@ def _worlds(path: Path, reconstruction: Reconstruction) -> list[World]:
         worlds.append(
             World("nerfstudio's normalised world", to_run.after(_of_nerfstudio(path.parent)))
         )
+    worlds.append(World("OpenSplat's centred world", to_run.after(_of_opensplat(reconstruction))))
     if len(reconstruction.points) < _FEWEST_POINTS:
         return worlds
     normalised = _of_gsplat(reconstruction)
@@ -132,9 +133,25 @@ def _worlds(path: Path, reconstruction: Reconstruction) -> list[World]:
     return worlds
 
 
+def _of_opensplat(reconstruction: Reconstruction) -> Similarity:
+    """From OpenSplat's world to that of the camera file: there the mean of the cameras is the
+    origin, and their largest coordinate 1 (OpenSplat, autoScaleAndCenterPoses)."""
+    centres = _file_centres(reconstruction)
+    middle = centres.mean(axis=0)
+    return Similarity(float(np.abs(centres - middle).max()), offset=middle)
+
+
+def _file_centres(reconstruction: Reconstruction) -> NDArray[np.float64]:
+    """[V, 3] the cameras in the world of their file."""
+    to_file = reconstruction.file_from_world
+    assert to_file is not None
+    centres = np.array([view.camera.centre for view in reconstruction.views])
+    return np.asarray(centres @ to_file[:3, :3].T + to_file[:3, 3])
+
+
 def _of_gsplat(reconstruction: Reconstruction) -> Similarity:
     """From the world that gsplat's example trainer normalises its data to, to that of the camera
-    file (gsplat, examples/datasets/normalize.py).
+    file (as its examples normalise cameras and points).
 
     There the mean up direction of the cameras is turned to -y, the median of the points on the
     viewing axes that are nearest to the origin becomes the origin, and the median distance of the

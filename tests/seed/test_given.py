@@ -104,6 +104,17 @@ def test_nerfstudios_normalised_world_is_read_from_beside_the_splats(
     assert NERFSTUDIO in caught.value.given
 
 
+def test_opensplats_centred_world_is_found(scene: SmallScene, tmp_path: Path) -> None:
+    cameras = [TO_FILE.apply_to_camera(view.camera) for view in scene.reconstruction.views]
+    centres = np.array([camera.centre for camera in cameras])
+    middle = centres.mean(axis=0)
+    scale = 1 / np.abs(centres - middle).max()
+    moved = Similarity(scale, np.eye(3), -scale * middle).after(TO_FILE)
+    path, report = written(tmp_path, scene.splats, moved), Report()
+    check_same(given_splats(path, scene.reconstruction, report), scene.splats)
+    assert report.metrics["given_world"] == "OpenSplat's centred world"
+
+
 def test_the_world_that_gsplat_normalises_to_is_found(scene: SmallScene, tmp_path: Path) -> None:
     """By the formulas of its examples/datasets/normalize.py, written out with matrices."""
     to_file = scene.reconstruction.file_from_world

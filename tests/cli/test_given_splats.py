@@ -1,0 +1,40 @@
+"""--splats on the command line: what is refused before any work, and how many steps are made."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from splatcli import run_settings
+from stages import formats
+from stages.base.errors import SplatError
+from tests.scenes import splats as some_splats
+
+
+@pytest.fixture
+def given(tmp_path: Path) -> Path:
+    path = tmp_path / "point_cloud.ply"
+    formats.write(path, some_splats([[0, 0, 1], [0, 1, 2]]))
+    return path
+
+
+def test_given_splats_are_not_trained_unless_steps_are_asked_for(given: Path) -> None:
+    assert run_settings.of_new_run({"splats": given})["train"].steps == 0
+    found = run_settings.of_new_run({"splats": given, "steps": 500, "preset": "preview"})
+    assert found["train"].steps == 500
+    assert found["seed"].splats == found["train"].splats == given
+
+
+def test_no_steps_without_given_splats_are_refused() -> None:
+    with pytest.raises(SplatError) as caught:
+        run_settings.of_new_run({"steps": 0})
+    assert caught.value.code == "option-alone"
+
+
+def test_what_no_run_could_use_is_refused_before_photographs_are_read(splat, given: Path) -> None:
+    for file, code in ((given, "seed-splats-without-cameras"), ("none.ply", "splats-unreadable")):
+        result = splat("process", "photos", "--splats", str(file))
+        assert result.exit_code != 0
+        assert code in result.stderr
+        assert not Path("run").exists()
