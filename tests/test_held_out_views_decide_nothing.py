@@ -98,5 +98,12 @@ def test_a_photograph_with_a_duplicate_is_not_held_out() -> None:
     assert len(training) == 15
 
 
+def test_where_all_have_duplicates_they_are_held_out_with_them() -> None:
+    twins = [f"{i - i % 2:02d}" for i in range(24)]  # every view was shot twice
+    training, held_out = split_held_out(views(*twins))
+    assert [view.name for view in held_out] == ["00", "01", "16", "17"]
+    assert not {view.duplicate_of for view in training} & {view.duplicate_of for view in held_out}
+
+
 def test_three_photographs_are_too_few_to_spare_one() -> None:
     assert split_held_out(views("", "", ""))[1] == ()

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from stages.ingest.colour import luminance
 from stages.scene import fitted_size
@@ -92,15 +90,15 @@ def _thumbnail(grey: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def near_duplicates(thumbnails: list[NDArray[np.float32]]) -> list[tuple[int, ...]]:
-    """Groups of indices of photographs that show nearly the same, each group in order."""
+    """Groups of indices of photographs that show nearly the same as the first of their group, in
+    order. Frames of a slow walk are each like the one before, and end far from the first."""
     stack = np.stack([thumbnail.ravel() for thumbnail in thumbnails])
-    pairs = [
-        (first, first + 1 + int(second))
-        for first in range(len(stack))
-        for second in np.flatnonzero(stack[first + 1 :] @ stack[first] > _ALIKE)
-    ]
-    ends = np.array(pairs, np.intp).reshape(-1, 2).T
-    links = coo_array((np.ones(len(pairs)), ends), shape=(len(stack), len(stack)))
-    count, labels = connected_components(links, directed=False)
-    groups = [tuple(map(int, np.flatnonzero(labels == label))) for label in range(count)]
-    return [group for group in groups if len(group) > 1]
+    groups: dict[int, list[int]] = {}
+    for number, thumbnail in enumerate(stack):
+        firsts = list(groups)
+        alike = stack[firsts] @ thumbnail
+        if len(firsts) and alike.max() > _ALIKE:
+            groups[firsts[int(alike.argmax())]].append(number)
+        else:
+            groups[number] = [number]
+    return [tuple(group) for group in groups.values() if len(group) > 1]

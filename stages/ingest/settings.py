@@ -66,7 +66,7 @@ class IngestSettings:
 
 STAGE = Stage(
     "ingest",
-    version=15,
+    version=16,
     reads=(),
     settings_type=IngestSettings,
     **in_module("stages.ingest.stage"),

@@ -204,24 +204,25 @@ def split_held_out(views: tuple[View, ...]) -> tuple[tuple[View, ...], tuple[Vie
     """(training views, held-out test views). Held out, for evaluation only, is the first of every
     eight views by name; where views have roles, those with the role "test".
 
-    A near-duplicate of another view would measure how well that other view was learnt, so the first
-    of the eight that is no near-duplicate is held out instead. With fewer than 4 views nothing is.
-    The faces of a panorama or fisheye count as one, and are held out together.
+    The faces of a panorama or fisheye count as one, and are held out together. So do
+    near-duplicates: one of them would measure how well the others were learnt. The first of the
+    eight without any is preferred to them. With fewer than 4 views nothing is held out.
     """
     ordered = tuple(sorted(views, key=lambda view: view.name))
     if any(view.role for view in ordered):
         test = tuple(view for view in ordered if view.role == "test")
         return tuple(view for view in ordered if view.role != "test"), test
-    frames = {view.frame or view.name: view for view in ordered}
-    if len(frames) < 4:
+    of_view = [view.duplicate_of or view.frame or view.name for view in ordered]
+    names = tuple(dict.fromkeys(of_view))
+    if len(names) < 4:
         return ordered, ()
-    names = tuple(frames)
+    several = {view.duplicate_of for view in ordered}
     eights = (names[i : i + HELD_OUT_EVERY] for i in range(0, len(names), HELD_OUT_EVERY))
-    distinct = ([name for name in eight if not frames[name].duplicate_of] for eight in eights)
-    held = {eight[0] for eight in distinct if eight}
+    held = {min(eight, key=lambda name: name in several) for eight in eights}
+    rows = list(zip(ordered, of_view, strict=True))
     return (
-        tuple(view for view in ordered if (view.frame or view.name) not in held),
-        tuple(view for view in ordered if (view.frame or view.name) in held),
+        tuple(view for view, name in rows if name not in held),
+        tuple(view for view, name in rows if name in held),
     )
 
 

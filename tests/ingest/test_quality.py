@@ -64,6 +64,14 @@ def test_shots_from_one_spot_are_near_duplicates_and_steps_are_not() -> None:
     assert near_duplicates(thumbnails) == [(0, 2, 4)]
 
 
+def test_a_slow_walk_is_not_one_group_because_each_is_like_the_one_before() -> None:
+    scene = cv2.GaussianBlur(textured(3, 1000, 600), (0, 0), 2).astype(np.uint8)
+    steps = [np.ascontiguousarray(scene[:, at : at + 800]) for at in range(0, 200, 2)]
+    groups = near_duplicates([measure(picture).thumbnail for picture in steps])
+    assert len(groups) > 5
+    assert all(group == tuple(range(group[0], group[-1] + 1)) for group in groups)
+
+
 def test_blank_pictures_are_measured_without_complaint() -> None:
     blank = measure(np.zeros((20, 30, 3), np.uint8))
     assert np.isfinite([blank.sharpness, blank.log2_luminance]).all()
