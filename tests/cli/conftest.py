@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from splatcli import console
 from splatcli.app import app
 from stages.base.stage import Stage
 from stages.run import pipeline
@@ -29,6 +30,13 @@ def _pretend(inputs: Any, settings: Any, folder: Path, report: Any) -> None:
 def _load(folder: Path) -> Any:
     file = SimpleNamespace(format="ply", path="out.ply", size_bytes=12)
     return SimpleNamespace(folder=folder, files=(file,))
+
+
+@pytest.fixture(autouse=True)
+def _width_of_each_test(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rich keeps the COLUMNS that were set when the module was imported, in whichever test."""
+    for screen in (console.out, console.err):
+        monkeypatch.setattr(screen, "_width", None)
 
 
 @pytest.fixture
