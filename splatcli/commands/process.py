@@ -98,6 +98,13 @@ def _run_stage(name: str, pipeline: Pipeline, given: Mapping[str, Any]) -> None:
     is_known = runfolder.is_run_folder(pipeline.run_folder)
     base = run_settings.recorded(pipeline)
     given = options.given_only(given)
+    if "splats" in given:
+        raise UsageError(
+            "option-alone",
+            given=f"--splats concerns seeding and training, and splat {name} runs one of them.",
+            wanted="The command of the whole run.",
+            hint=f"splat process {pipeline.run_folder} --splats FILE",
+        )
     preset, view = given.pop("preset", None), given.pop("view", False)
     if "formats" in given:
         given["formats"] = pipeline.with_exported(given["formats"])

@@ -28,7 +28,7 @@ class SeedSettings:
 
 STAGE = Stage(
     "seed",
-    version=8,
+    version=9,
     reads=("sfm",),
     settings_type=SeedSettings,
     **in_module("stages.seed.stage"),

@@ -117,7 +117,7 @@ PRESETS: dict[str, TrainSettings] = {
 
 STAGE = Stage(
     "train",
-    version=34,
+    version=35,
     reads=("sfm", "seed"),
     settings_type=TrainSettings,
     **in_module("stages.train.stage"),

@@ -89,7 +89,7 @@ def run(
     remove_cap(folder)
     report.metric("splats", len(splats))
     _report_course(trainer, report)
-    if settings.seconds and trainer.schedule.steps < _FEW_STEPS:
+    if settings.seconds and 0 < trainer.schedule.steps < _FEW_STEPS:
         report.warn(
             "train-few-steps",
             f"The time limit left {trainer.schedule.steps:,} steps for training; --preset preview "

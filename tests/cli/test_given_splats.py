@@ -38,3 +38,11 @@ def test_what_no_run_could_use_is_refused_before_photographs_are_read(splat, giv
         assert result.exit_code != 0
         assert code in result.stderr
         assert not Path("run").exists()
+
+
+def test_one_stage_alone_does_not_take_given_splats(splat, given: Path) -> None:
+    assert splat("process", "photos").exit_code == 0
+    for stage in ("seed", "train"):
+        result = splat(stage, "run", "--splats", str(given))
+        assert result.exit_code == 2
+        assert "splat process run --splats" in result.stderr
