@@ -43,8 +43,13 @@ FORMAT_CELLS = (
     ),
     (
         ("spz",),
-        "Spark, Open3D, three.js",
+        "Spark, Open3D, three.js: version 3, which nearly every reader of SPZ knows",
         "sizes to 3 %, 8-bit colour, 4 to 5 bits of view-dependent colour",
+    ),
+    (
+        ("v4.spz",),
+        "PlayCanvas, Open3D, three.js of August 2026 or newer: version 4",
+        "as `spz`; written and read faster",
     ),
     (
         ("sog",),

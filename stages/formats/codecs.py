@@ -73,6 +73,13 @@ _GLTF = Codec(gltf.write, gltf_read.read)
 _FEW, _TEN = 0.01, math.log(10)  # a share of splats that may be too small to be seen
 _USD = Codec(usd.write, usd_read.read)
 _SIZES = (-compressed_ply.LOG_SCALE_LIMIT, compressed_ply.LOG_SCALE_LIMIT)
+_SPZ = Codec(
+    spz.write,
+    spz_read.read,
+    positions="holds positions of 24 bits, and moves what lies farther out towards the origin",
+    log_sizes=spz.LOG_SIZES,
+    most_sh=1.0,
+)
 CODECS = {
     "ply": Codec(ply.write, ply.read),
     "splat": Codec(splat32.write, splat32.read, order=splat32.order),
@@ -90,13 +97,8 @@ CODECS = {
         log_sizes=_SIZES,
         most_sh=compressed_ply.SH_LIMIT,
     ),
-    "spz": Codec(
-        spz.write,
-        spz_read.read,
-        positions="holds positions of 24 bits, and moves what lies farther out towards the origin",
-        log_sizes=spz.LOG_SIZES,
-        most_sh=1.0,
-    ),
+    "spz": _SPZ,
+    "v4.spz": replace(_SPZ, write=spz.write_4),
     "sog": Codec(
         *(sog.write, sog_read.read, sog_read.units, morton_order),
         positions="holds positions of 16 bits in the range of all",

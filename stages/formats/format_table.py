@@ -114,6 +114,14 @@ TABLE = (
         y_up=True,
     ),
     Format(
+        "v4.spz",
+        holds_origin=False,
+        loses="has sizes in steps of 6 %, 8-bit colours and view-dependent colour of 4 and 5 bits",
+        needs_finetuning=True,
+        drawn_antialiased=True,
+        y_up=True,
+    ),
+    Format(
         "sog",
         has_bit_depths=True,
         loses="has 256 sizes and colours, and a palette of view-dependent colours",

@@ -1,35 +1,46 @@
-"""SPZ: about an eighth of a .ply, for the web. Written as version 3, which most viewers read.
+"""SPZ: about an eighth of a .ply, for the web. Written as version 3 or 4.
 
-gzip around a header of 16 bytes (magic "NGSP", version, count, SH degree, fractional bits of
-positions, flags, 0) and one array after the other: positions 3 x 24-bit fixed point, opacities
-uint8 (255 sigmoid, kept within 1..254), colours 3 x uint8 (0.15 dc + 0.5), scales 3 x uint8
-(16 (ln + 10)), rotations (smallest three of x, y, z, w in 32 bits), SH uint8 (128 + 128 c),
-coefficients of one splat together, RGB last. Axes: right, up, back (y up). Specification:
-nianticlabs/spz, README.
+Version 3, which most viewers read: gzip around a header of 16 bytes (magic "NGSP", version, count,
+SH degree, fractional bits of positions, flags, 0) and one array after the other: positions 3 x
+24-bit fixed point, opacities uint8 (255 sigmoid, kept within 1..254), colours 3 x uint8 (0.15 dc +
+0.5), scales 3 x uint8 (16 (ln + 10)), rotations (smallest three of x, y, z, w in 32 bits), SH uint8
+(128 + 128 c), coefficients of one splat together, RGB last. Axes: right, up, back (y up). Version
+4: the same arrays, each in a zstd frame; see `spz_read`. Specification: nianticlabs/spz, README.
 """
 
 from __future__ import annotations
 
 import gzip
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
+import zstandard
 from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.base.row_slices import row_slices
 from stages.formats import smallest_three
-from stages.formats.spz_read import ANTIALIASED, COLOUR_SCALE, HEADER, MAGIC, MAGNITUDE
+from stages.formats.spz_read import (
+    ANTIALIASED,
+    COLOUR_SCALE,
+    HEADER,
+    MAGIC,
+    MAGNITUDE,
+    TABLE_ROW,
+    TABLE_STARTS,
+    Header,
+)
 from stages.formats.values import linear_opacities, unit_quaternions
 from stages.scene import Splats
 from stages.scene.flip import FLIP, flipped
 from stages.scene.quantiles import median_spacing
 
 _LEVEL = 6  # 9 takes eight times as long for 1 % less
+_ZSTD_LEVEL = 12  # that of the format's own library
 _USUAL_FRACTIONAL_BITS, _MOST_FRACTIONAL_BITS = 12, 23
 # Where 12 fractional bits do not hold the scene, fewer do: steps up to this share of the distance
 # between neighbouring splats.
@@ -40,16 +51,51 @@ _SH_STEPS = (8, 16, 16)  # of 256, for degree 1, 2, 3: 5 and 4 bits, which gzip 
 
 
 def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
-    """Write `splats`.
+    """Write `splats` as version 3.
 
     The format has no field for units and the origin; `formats.write` writes them beside it. A splat
     beyond the range of 24 bits is moved closer along its ray and scaled
     down, which looks the same from the centre. Raises SplatError when the file cannot be written.
     """
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        pack(file, splats)
+
+
+def pack(file: BinaryIO, splats: Splats) -> None:
+    """Write `splats` to an open file as `write` does."""
+    head, arrays = _encoded(splats)
+    # without a name and a time, so that equal splats give equal bytes
+    with gzip.GzipFile("", "wb", _LEVEL, file, mtime=0) as packed:
+        packed.write(HEADER.pack(*head))
+        for array in arrays:
+            packed.writelines(array)
+
+
+def write_4(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
+    """Write `splats` as `write` does, but as version 4."""
+    head, arrays = _encoded(splats)
+    sizes = [head.splats * width for width in head.widths if width]
+    head = head._replace(version=4, streams=len(sizes))
+    table_starts = HEADER.size + TABLE_STARTS.size
+    table = b""
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        file.write(HEADER.pack(*head) + TABLE_STARTS.pack(table_starts))
+        file.seek(table_starts + len(sizes) * TABLE_ROW.size)
+        for size, array in zip(sizes, arrays, strict=False):
+            start, packer = file.tell(), zstandard.ZstdCompressor(_ZSTD_LEVEL)
+            with packer.stream_writer(file, size, closefd=False) as packed:
+                for block in array:
+                    packed.write(block)
+            table += TABLE_ROW.pack(file.tell() - start, size)
+        file.seek(table_starts)
+        file.write(table)
+
+
+def _encoded(splats: Splats) -> tuple[Header, list[Iterator[memoryview]]]:
+    """The header of version 3, and the blocks of each array."""
     degree = int(splats.sh_degrees.max(initial=0))
     splats = splats.with_sh_degree(degree)
     bits, flags = _fractional_bits(splats.means), ANTIALIASED * splats.draw_settings.antialias
-    header = HEADER.pack(MAGIC, 3, len(splats), degree, bits, flags, 0)
     arrays: tuple[Callable[[Splats], NDArray[Any]], ...] = (
         lambda block: _positions(block, bits),
         _opacities,
@@ -58,16 +104,14 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
         lambda block: _pack_rotations(flipped(block.with_sh_degree(0)).quaternions),
         _sh,
     )
-    with (
-        replacing(path) as temporary,
-        temporary.open("wb") as file,
-        # without a name and a time, so that equal splats give equal bytes
-        gzip.GzipFile("", "wb", _LEVEL, file, mtime=0) as packed,
-    ):
-        packed.write(header)
-        for array in arrays:
-            for rows in row_slices(len(splats)):
-                packed.write(np.ascontiguousarray(array(splats.take(rows))).data)
+    return Header(MAGIC, 3, len(splats), degree, bits, flags, 0), [
+        _blocks(array, splats) for array in arrays
+    ]
+
+
+def _blocks(array: Callable[[Splats], NDArray[Any]], splats: Splats) -> Iterator[memoryview]:
+    for rows in row_slices(len(splats)):
+        yield np.ascontiguousarray(array(splats.take(rows))).data
 
 
 def _reach(bits: int) -> float:

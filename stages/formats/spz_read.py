@@ -2,8 +2,9 @@
 
 The arrays are those of `spz`. Versions 2 and 3: gzip around a header of 16 bytes and the arrays;
 rotations of version 2 are x, y, z as uint8. Version 4: an uncompressed header of 32 bytes, records
-of extensions, a table of (packed, unpacked) sizes as uint64, and one zstd stream an array; without
-SH above degree 0 there is no array for it. Specification: nianticlabs/spz, README.
+of extensions, a table of (packed, unpacked) sizes as uint64, and one zstd frame an array; empty
+arrays may be left out. Of SH of degree 4, degrees to 3 are kept. Specification: nianticlabs/spz,
+README.
 """
 
 from __future__ import annotations
@@ -28,8 +29,9 @@ HEADER = struct.Struct("<4sIIBBBB")
 MAGIC = b"NGSP"
 COLOUR_SCALE = 0.15
 MAGNITUDE = 511  # 9 bits beside a sign
-_TABLE_STARTS = struct.Struct("<I12x")  # follows HEADER in version 4, whose last byte is a count
-_TABLE_ROW, _RECORD = struct.Struct("<QQ"), struct.Struct("<II")
+_MOST_DEGREE, _KEPT_DEGREE = 4, 3  # of SH: in files, and in `Splats`
+TABLE_STARTS = struct.Struct("<I12x")  # follows HEADER in version 4, whose last byte is a count
+TABLE_ROW, _RECORD = struct.Struct("<QQ"), struct.Struct("<II")
 ANTIALIASED, _HAS_EXTENSIONS = 1, 2  # in the flags
 _EXTENSIONS_LIMIT_BYTES = 1 << 20
 # SPZ_ADOBE_coordinate_system: axes other than right, up, back. Codes of the reference library:
@@ -58,7 +60,7 @@ class Header(NamedTuple):
         """Bytes a splat takes in each array: positions, opacities, colours, scales, rotations, SH.
         Raises BadFileError for a degree or a precision that no file has."""
         degree, bits = self.degree, self.bits
-        if degree > 3 or bits > 31:
+        if degree > _MOST_DEGREE or bits > 31:
             raise BadFileError(f"its SH degree is {degree} and its fractional bits are {bits}")
         return (9, 1, 3, 3, 3 if self.version == 2 else 4, 3 * ((degree + 1) ** 2 - 1))
 
@@ -98,10 +100,11 @@ def _of_streams(file: BinaryIO, size: int) -> _Content:
     head, extensions, table = _table(file, size)
     sizes, count = head.widths, head.splats
     check_size(count * sum(sizes), size)
-    if head.streams < len(sizes) - (sizes[-1] == 0):
+    if head.streams < sum(count * width > 0 for width in sizes):
         raise BadFileError(f"it has {head.streams} streams for {len(sizes)} arrays")
     arrays = []
-    for width, (packed, declared) in zip(sizes, [*table, (0, 0)], strict=False):
+    table += [(0, 0)] * len(sizes)  # arrays that are left out
+    for width, (packed, declared) in zip(sizes, table, strict=False):
         if declared != count * width:
             raise BadFileError(f"it declares {declared} bytes for {count} times {width}")
         if packed > size:
@@ -113,20 +116,20 @@ def _of_streams(file: BinaryIO, size: int) -> _Content:
 def _table(file: BinaryIO, size: int) -> tuple[Header, bytes, list[tuple[int, int]]]:
     """(header, extensions, (packed, unpacked) bytes of each stream) of a file of version 4. The
     file position is then at the streams."""
-    head = file.read(HEADER.size + _TABLE_STARTS.size)
-    if len(head) < HEADER.size + _TABLE_STARTS.size:
+    head = file.read(HEADER.size + TABLE_STARTS.size)
+    if len(head) < HEADER.size + TABLE_STARTS.size:
         raise BadFileError("it is cut short")
     values = Header.of(head)
-    (starts,) = _TABLE_STARTS.unpack_from(head, HEADER.size)
+    (starts,) = TABLE_STARTS.unpack_from(head, HEADER.size)
     if values.version != 4:
         raise BadFileError(f"it is SPZ version {values.version} without gzip; there 4 is read")
     if not 0 <= starts - len(head) <= min(_EXTENSIONS_LIMIT_BYTES, size):
         raise BadFileError(f"its table starts at {starts}")
     extensions = file.read(starts - len(head))
-    table = file.read(values.streams * _TABLE_ROW.size)
-    if len(table) < values.streams * _TABLE_ROW.size:
+    table = file.read(values.streams * TABLE_ROW.size)
+    if len(table) < values.streams * TABLE_ROW.size:
         raise BadFileError("it is cut short")
-    return values, extensions, list(_TABLE_ROW.iter_unpack(table))
+    return values, extensions, list(TABLE_ROW.iter_unpack(table))
 
 
 def _is_y_up(records: bytes) -> bool:
@@ -147,7 +150,7 @@ def _is_y_up(records: bytes) -> bool:
 def _decoded(head: Header, arrays: list[NDArray[np.uint8]]) -> Splats:
     """The splats in the axes of the file."""
     positions, opacities, colours, scales, rotations, sh = arrays
-    splats = allocate(len(positions), head.degree)
+    splats = allocate(len(positions), min(head.degree, _KEPT_DEGREE))
     for rows in row_slices(len(positions)):
         out = splats.take(rows)
         padded = np.zeros((len(out), 3, 4), np.uint8)
@@ -158,7 +161,8 @@ def _decoded(head: Header, arrays: list[NDArray[np.uint8]]) -> Splats:
         out.log_scales[:] = scales[rows].astype(np.float32) / 16 - 10
         out.opacity_logits[:] = logits_of(opacities[rows, 0] / 255)
         out.sh[:, 0] = (colours[rows] / 255 - 0.5) / COLOUR_SCALE
-        out.sh[:, 1:] = (sh[rows].reshape(len(out), -1, 3).astype(np.float32) - 128) / 128
+        kept = sh[rows].reshape(len(out), -1, 3)[:, : out.sh.shape[1] - 1]
+        out.sh[:, 1:] = (kept.astype(np.float32) - 128) / 128
     return splats
 
 

@@ -34,6 +34,7 @@ class Checks:
 
 _PLY = Checks(independent_readers.ply)
 _GLTF = Checks(independent_readers.gltf)
+_SPZ = Checks(independent_packed.spz)
 _USD = Checks(independent_readers.usd, usd_validation.usd_errors)
 CHECKS = {
     "ply": _PLY,
@@ -45,7 +46,8 @@ CHECKS = {
     "usdz": _USD,
     "quantised.glb": _GLTF,
     "compressed.ply": Checks(independent_packed.compressed_ply),
-    "spz": Checks(independent_packed.spz),
+    "spz": _SPZ,
+    "v4.spz": _SPZ,
     "sog": Checks(independent_packed.sog),
     "lod-meta.json": Checks(independent_packed.streamed_sog),
     "html": Checks(independent_readers.html),

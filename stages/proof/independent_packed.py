@@ -1,4 +1,4 @@
-"""Independent readers of the packed formats: plyfile, gzip, zipfile and Pillow, and our
+"""Independent readers of the packed formats: plyfile, gzip, zstandard, zipfile and Pillow, and our
 arithmetic. They share no code with `stages.formats`."""
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+import zstandard
 from numpy.typing import NDArray
 from PIL import Image
 from plyfile import PlyData
@@ -69,12 +70,10 @@ def compressed_ply(path: Path) -> Splats:
 
 def spz(path: Path) -> Splats:
     packed = path.read_bytes()
-    if packed.startswith(b"NGSP"):  # without gzip
-        raise NotCrossCheckedError(f"SPZ version {packed[4]}")
-    content = gzip.decompress(packed)
+    content = _joined(packed) if packed.startswith(b"NGSP") else gzip.decompress(packed)
     magic, version, n, degree, fraction, flags = struct.unpack_from("<IIIBBB", content)
     assert magic == 0x5053474E, "the header does not begin with NGSP"
-    assert version in (2, 3), f"the version is {version}, not 2 or 3"
+    assert version in (2, 3, 4), f"the version is {version}, not 2, 3 or 4"
     k = (degree + 1) ** 2 - 1
     turn_bytes = 3 if version == 2 else 4
     ends = 16 + np.cumsum([0, 9 * n, n, 3 * n, 3 * n, turn_bytes * n, 3 * k * n])
@@ -88,9 +87,9 @@ def spz(path: Path) -> Splats:
         places, alphas, colours, sizes, rotations, rest = (part[rows] for part in parts)
         low, middle, high = places.reshape(-1, 3, 3).astype(np.int64).transpose(2, 0, 1)
         fixed = low + 256 * middle + 65536 * high
-        sh = np.zeros((len(alphas), k + 1, 3), np.float32)
+        sh = np.zeros((len(alphas), min(k, 15) + 1, 3), np.float32)
         sh[:, 0] = (colours.reshape(-1, 3) / 255 - 0.5) / 0.15
-        sh[:, 1:] = rest.reshape(len(alphas), k, 3) / 128 - 1
+        sh[:, 1:] = rest.reshape(len(alphas), k, 3)[:, :15] / 128 - 1
         xyzw = _xyz_in_bytes(rotations) if version == 2 else _smallest_three(rotations)
         return {
             "means": np.where(fixed < 1 << 23, fixed, fixed - (1 << 24)) / 2**fraction,
@@ -101,6 +100,21 @@ def spz(path: Path) -> Splats:
         }
 
     return splats_by_rows(n, values_of).with_antialias(flags & 1 == 1)
+
+
+def _joined(whole: bytes) -> bytes:
+    """A file of version 4 in the layout of version 3: the first 16 bytes, then all arrays."""
+    (table,) = struct.unpack_from("<I", whole, 16)
+    if table != 32:
+        raise NotCrossCheckedError("extensions of SPZ 4")
+    start = table + 16 * whole[15]
+    parts = [whole[:16]]
+    for packed, size in struct.iter_unpack("<QQ", whole[table:start]):
+        frame = whole[start : start + packed]
+        parts.append(zstandard.ZstdDecompressor().decompress(frame, max_output_size=size))
+        start += packed
+    assert start == len(whole), "the length is not that of the table"
+    return b"".join(parts)
 
 
 def _xyz_in_bytes(parts: NDArray[np.uint8]) -> NDArray[np.float64]:

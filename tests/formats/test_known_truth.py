@@ -46,6 +46,7 @@ LOSSES = {
     "quantised.glb": (1e-5, 1e-6),
     "compressed.ply": (1e-3, 0.023),
     "spz": (6e-3, 0.04),
+    "v4.spz": (6e-3, 0.04),
     "sog": (2e-3, 1e-6),
 }
 

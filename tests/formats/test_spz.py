@@ -194,7 +194,7 @@ def packed(splats: Splats, tmp_path: Path, at: int, new: bytes, extra: bytes = b
         (4, b"\4", "version 4"),
         (8, b"\xff\xff\xff\xff", "declares"),
         (8, b"\xff\xff\0\0", "cut short"),
-        (12, b"\4", "degree is 4"),
+        (12, b"\5", "degree is 5"),
         (12, b"\xff", "degree is 255"),
         (13, b"\xff", "fractional"),
     ],

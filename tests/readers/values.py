@@ -143,13 +143,13 @@ READERS = (
     Reader("plyfile", ("ply",), read_back),
     Reader("pygltflib", ("glb", "gltf", "quantised.glb"), read_back),
     Reader("usd-core", ("usda", "usdc", "usdz"), read_back),
-    Reader("gsply", ("ply", "compressed.ply", "spz"), _gsply),
+    Reader("gsply", ("ply", "compressed.ply", "spz", "v4.spz"), _gsply),
     Reader("tinyusdz", ("usda", "usdc", "usdz"), _tinyusdz),
     Reader(
         "splat-transform",
-        ("ply", "splat", "compressed.ply", "spz", "sog", "lod-meta.json"),
+        ("ply", "splat", "compressed.ply", "spz", "v4.spz", "sog", "lod-meta.json"),
         _splat_transform,
     ),
-    Reader("@adobe/spz", ("spz",), _adobe_spz),
-    Reader("Open3D", ("ply", "splat", "spz"), _open3d),
+    Reader("@adobe/spz", ("spz", "v4.spz"), _adobe_spz),
+    Reader("Open3D", ("ply", "splat", "spz", "v4.spz"), _open3d),
 )
