@@ -37,6 +37,11 @@ FORMAT_CELLS = (
         "sizes, rotations and opacities in 16 bits",
     ),
     (
+        ("spz.glb",),
+        "CesiumJS, and others with KHR_gaussian_splatting_compression_spz_2",
+        "as `spz`",
+    ),
+    (
         ("compressed.ply",),
         "PlayCanvas, SuperSplat, Spark",
         "positions and sizes to 1/1000 of those of 256 neighbours, 8-bit colour",

@@ -15,6 +15,7 @@ from stages.formats import (
     gltf,
     gltf_quantised,
     gltf_read,
+    gltf_spz,
     html,
     ply,
     sog,
@@ -89,6 +90,7 @@ CODECS = {
     "usdc": replace(_USD, units=usd_read.units),
     "usdz": replace(_USD, units=usd_read.units),
     "quantised.glb": Codec(gltf_quantised.write, gltf_read.read, order=gltf_quantised.order),
+    "spz.glb": replace(_SPZ, write=gltf_spz.write, read=gltf_read.read),
     "compressed.ply": Codec(
         compressed_ply.write,
         compressed_ply.read,

@@ -101,6 +101,12 @@ TABLE = (
     Format("usdz", y_up=True),
     Format("quantised.glb", loses="has rotations, sizes and opacities of 16 bits", y_up=True),
     Format(
+        "spz.glb",
+        loses="has sizes in steps of 6 %, 8-bit colours and view-dependent colour of 4 and 5 bits",
+        needs_finetuning=True,
+        y_up=True,
+    ),
+    Format(
         "compressed.ply",
         loses="has positions and sizes of 10 and 11 bits, and 8-bit colours",
         needs_finetuning=True,

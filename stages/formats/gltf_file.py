@@ -27,6 +27,7 @@ from stages.scene.place import EarthPlace
 from stages.scene.rotations import quaternions_of
 
 EXTENSION = "KHR_gaussian_splatting"
+SPZ_EXTENSION = f"{EXTENSION}_compression_spz_2"
 _COMPONENT_TYPES = {"<f4": 5126, "<i2": 5122, "<u2": 5123, "|u1": 5121, "<u4": 5125}
 _GLB_LIMIT_BYTES = (1 << 32) - 1
 _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
@@ -57,6 +58,7 @@ def write_file(
     units: str,
     *,
     node_scale: float = 1.0,
+    payload: NDArray[np.uint8] | None = None,
 ) -> None:
     """Write a node of splats, and one of their first camera if it is known, as `path` (.glb, or
     .gltf with its .bin), completely or not at all.
@@ -70,6 +72,8 @@ def write_file(
             it.
         units: "metres" or "arbitrary".
         node_scale: scale of the node.
+        payload: the attributes of the only primitive as the bytes of a .spz; they are then
+            described and not stored.
 
     Raises SplatError when a file cannot be written or a .glb would exceed 4 GiB.
     """
@@ -81,6 +85,9 @@ def write_file(
         near = splats.draw_settings.near or near_plane_of(splats.means)
         _add_camera(document, y_up.first_camera, near)
     written = [attribute for attributes in primitives for attribute in attributes.values()]
+    if written and payload is not None:
+        _compress(document, len(payload))
+        written = [Attribute(np.pad(payload, (0, -len(payload) % 4)).reshape(-1, 4), 4)]
     write = write_glb if path.suffix.lower() == ".glb" else _write_pair
     write(path, document, written)
 
@@ -110,6 +117,17 @@ def _document(
         "meshes": [{"primitives": described, "name": "splats"}],
         **buffer_fields(written),
     }
+
+
+def _compress(document: dict[str, Any], size: int) -> None:
+    """Let a payload of `size` bytes stand for the attributes of the only primitive. CesiumJS 1.146
+    takes it from the first buffer view, whichever is named."""
+    for accessor in document["accessors"]:
+        del accessor["bufferView"]
+    document["bufferViews"] = [{"buffer": 0, "byteLength": size}]
+    (primitive,) = document["meshes"][0]["primitives"]
+    primitive["extensions"][EXTENSION]["extensions"] = {SPZ_EXTENSION: {"bufferView": 0}}
+    document["extensionsUsed"] = document["extensionsRequired"] = [EXTENSION, SPZ_EXTENSION]
 
 
 def _add_camera(document: dict[str, Any], camera: Camera, near: float) -> None:

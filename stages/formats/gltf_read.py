@@ -1,4 +1,4 @@
-"""Reads KHR_gaussian_splatting, written by this project or by other programs.
+"""Reads KHR_gaussian_splatting, also compressed as SPZ, written by this project or by others.
 
 Every number of the JSON is checked before use, because a file may come from anywhere. Buffers are
 the binary chunk, data: URIs, or files in its folder or below; nothing is fetched.
@@ -7,11 +7,12 @@ the binary chunk, data: URIs, or files in its folder or below; nothing is fetche
 from __future__ import annotations
 
 import base64
+import io
 import json
 import math
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
@@ -20,7 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError
+from stages.formats import spz_read
 from stages.formats.first_camera import camera_of
+from stages.formats.gltf_file import EXTENSION, SPZ_EXTENSION
+from stages.formats.inflate import check_size
 from stages.formats.json_fields import located, numbers, whole
 from stages.formats.values import concatenate, log_scales_of, logits_of
 from stages.scene import Camera, Splats
@@ -28,7 +32,6 @@ from stages.scene.flip import flipped
 from stages.scene.recentring import recentred_splats
 from stages.scene.rotations import matrices_of
 
-_EXTENSION = "KHR_gaussian_splatting"
 _TYPES = {5120: "i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _ASPECT = 4 / 3  # of cameras that state none
@@ -41,7 +44,7 @@ def read(path: Path) -> Splats:
     Nodes may be translated and uniformly scaled; positions far from zero keep their precision in
     `origin`. Of cameras the first in perspective is kept. Raises BadFileError for a damaged file,
     one without splats, one that refers to files outside its folder, or an unsupported feature
-    (sparse accessors, compression, splats in rotated nodes).
+    (sparse accessors, other compression, splats in rotated nodes).
     """
     document, chunk = _parse(path)
     buffers = _Buffers(path, _list(document, "buffers"), chunk)
@@ -52,17 +55,19 @@ def read(path: Path) -> Splats:
         for part in source.splats(node, matrix):
             parts.append(part)
             # Splats that are not shared cannot be more than this, which bounds the memory.
-            if sum(map(len, parts)) * _MIN_SPLAT_BYTES > buffers.total_bytes():
+            most = buffers.total_bytes() + sum(source.unpacked_bytes.values())
+            if sum(map(len, parts)) * _MIN_SPLAT_BYTES > most:
                 raise BadFileError("its nodes share meshes, which is not supported")
     extras = document["asset"].get("extras")
     extras = extras if isinstance(extras, dict) else {}
     if not parts and "meshes" in document:
-        raise BadFileError(f"it is a mesh, not splats: nothing in it uses {_EXTENSION}")
+        raise BadFileError(f"it is a mesh, not splats: nothing in it uses {EXTENSION}")
+    antialias = any(part.draw_settings.antialias for part in parts)  # as SPZ says
     splats = concatenate(parts)
     del parts
     splats = located(splats, extras)
     splats = replace(splats, first_camera=_first_camera(document, nodes))
-    splats = recentred_splats(splats).with_antialias(bool(extras.get("antialiased", False)))
+    splats = recentred_splats(splats).with_antialias(bool(extras.get("antialiased", antialias)))
     return flipped(splats, reuse=True)
 
 
@@ -95,7 +100,7 @@ def _parse(path: Path) -> tuple[dict[str, Any], memoryview | None]:
         raise BadFileError("it is not a glTF document")
     if str(document["asset"].get("version")).split(".")[0] != "2":
         raise BadFileError("it is not glTF version 2")
-    required = set(_list(document, "extensionsRequired")) - {_EXTENSION}
+    required = set(_list(document, "extensionsRequired")) - {EXTENSION, SPZ_EXTENSION}
     if required:
         raise BadFileError(f"it requires {', '.join(sorted(map(str, required)))[:80]}")
     return document, chunk
@@ -222,8 +227,11 @@ def _first_camera(document: dict[str, Any], nodes: list[_Placed]) -> Camera | No
 
 @dataclass(frozen=True)
 class _Source:
+    """unpacked_bytes: by buffer view of SPZ, at least what its splats would take uncompressed."""
+
     document: dict[str, Any]
     buffers: _Buffers
+    unpacked_bytes: dict[int, int] = field(default_factory=dict)
 
     def splats(self, node: dict[str, Any], matrix: NDArray[np.float64]) -> Iterator[Splats]:
         """The splats of a node's mesh, primitive after primitive, in the file's axes."""
@@ -232,9 +240,9 @@ class _Source:
         mesh = _item(_list(self.document, "meshes"), node["mesh"], "mesh")
         for primitive in _list(mesh, "primitives"):
             extensions = primitive.get("extensions") if isinstance(primitive, dict) else None
-            if isinstance(extensions, dict) and isinstance(extensions.get(_EXTENSION), dict):
+            if isinstance(extensions, dict) and isinstance(extensions.get(EXTENSION), dict):
                 placed = _scale_and_offset(matrix)
-                yield self._primitive(primitive, extensions[_EXTENSION], *placed)
+                yield self._primitive(primitive, extensions[EXTENSION], *placed)
 
     def _primitive(
         self,
@@ -243,17 +251,19 @@ class _Source:
         scale: float,
         offset: NDArray[np.float64],
     ) -> Splats:
-        if extension.get("kernel") != "ellipse":
-            raise BadFileError("its splats have another kernel than ellipse")
-        if extension.get("colorSpace") != "srgb_rec709_display":
-            raise BadFileError("its colours are in another space than srgb_rec709_display")
+        compressions = extension.get("extensions")
+        if isinstance(compressions, dict) and isinstance(compressions.get(SPZ_EXTENSION), dict):
+            said = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"} | extension
+            _check_drawing(said)
+            return self._spz(whole(compressions[SPZ_EXTENSION], "bufferView"), scale, offset)
+        _check_drawing(extension)
         if "extensions" in extension:
-            raise BadFileError("its splats are compressed, which is not supported")
+            raise BadFileError("its splats are compressed in a way that is not supported")
         attributes = primitive.get("attributes")
         if not isinstance(attributes, dict):
             raise BadFileError("a primitive has no attributes")
         degree = max(
-            d for d in range(4) if d == 0 or f"{_EXTENSION}:SH_DEGREE_{d}_COEF_0" in attributes
+            d for d in range(4) if d == 0 or f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in attributes
         )
 
         def values(name: str, width: int) -> NDArray[np.float32]:
@@ -262,15 +272,15 @@ class _Source:
             return self._accessor(attributes[name], width)
 
         means = values("POSITION", 3)
-        rotations = values(f"{_EXTENSION}:ROTATION", 4)
-        scales = values(f"{_EXTENSION}:SCALE", 3)
-        opacities = values(f"{_EXTENSION}:OPACITY", 1)
+        rotations = values(f"{EXTENSION}:ROTATION", 4)
+        scales = values(f"{EXTENSION}:SCALE", 3)
+        opacities = values(f"{EXTENSION}:OPACITY", 1)
         if len({len(array) for array in (means, rotations, scales, opacities)}) != 1:
             raise BadFileError("the attributes of a primitive differ in length")
         sh = np.empty((len(means), (degree + 1) ** 2, 3), np.float32)
         for d in range(degree + 1):
             for i in range(2 * d + 1):
-                coefficient = values(f"{_EXTENSION}:SH_DEGREE_{d}_COEF_{i}", 3)
+                coefficient = values(f"{EXTENSION}:SH_DEGREE_{d}_COEF_{i}", 3)
                 if len(coefficient) != len(means):
                     raise BadFileError("the attributes of a primitive differ in length")
                 sh[:, d * d + i] = coefficient
@@ -284,6 +294,26 @@ class _Source:
             sh_degrees=np.full(len(means), degree, np.uint8),
         )
 
+    def _spz(self, index: int, scale: float, offset: NDArray[np.float64]) -> Splats:
+        """The splats of SPZ in a buffer view, stored in the axes of glTF: see `gltf_spz`."""
+        content = bytes(self._view(index))
+        splats, _ = spz_read.unpack(io.BytesIO(content), len(content))
+        self.unpacked_bytes[index] = len(splats) * _MIN_SPLAT_BYTES
+        check_size(sum(self.unpacked_bytes.values()), self.buffers.total_bytes())
+        return replace(
+            splats,
+            means=splats.means.astype(np.float64) * scale + offset,
+            log_scales=splats.log_scales + np.float32(math.log(scale)),
+        )
+
+    def _view(self, index: Any) -> memoryview:
+        view = _item(_list(self.document, "bufferViews"), index, "buffer view")
+        content = self.buffers.get(whole(view, "buffer"))
+        start, length = whole(view, "byteOffset", 0), whole(view, "byteLength")
+        if start + length > len(content):
+            raise BadFileError(f"buffer view {index} reaches past its buffer")
+        return content[start : start + length]
+
     def _accessor(self, index: Any, width: int) -> NDArray[np.float32]:
         """[count, width] float32, normalised integers decoded."""
         accessor = _item(_list(self.document, "accessors"), index, "accessor")
@@ -296,9 +326,8 @@ class _Source:
             raise BadFileError(f"accessor {index} has a type that its attribute must not have")
         dtype = np.dtype(_TYPES[accessor["componentType"]])
         count = whole(accessor, "count")
-        view = _item(_list(self.document, "bufferViews"), accessor["bufferView"], "buffer view")
-        content = self.buffers.get(whole(view, "buffer"))
-        start, length = whole(view, "byteOffset", 0), whole(view, "byteLength")
+        content = self._view(accessor["bufferView"])
+        view = self.document["bufferViews"][accessor["bufferView"]]
         offset = whole(accessor, "byteOffset", 0)
         element = dtype.itemsize * width
         row_bytes = whole(view, "byteStride", element)
@@ -306,17 +335,25 @@ class _Source:
             raise BadFileError(
                 f"accessor {index} has byteStride {row_bytes} for elements of {element}"
             )
-        if start + length > len(content) or offset + (count - 1) * row_bytes + element > length:
+        if offset + (count - 1) * row_bytes + element > len(content):
             raise BadFileError(f"accessor {index} reaches past its buffer")
         if count * _MIN_SPLAT_BYTES > self.buffers.total_bytes():
             raise BadFileError(f"accessor {index} counts more splats than its buffers can hold")
         raw: NDArray[Any] = np.ndarray(
-            (count, width), dtype, content, start + offset, (row_bytes, dtype.itemsize)
+            (count, width), dtype, content, offset, (row_bytes, dtype.itemsize)
         )
         values = raw.astype(np.float32)
         if accessor.get("normalized") is True and dtype.kind in "iu":
             values = np.maximum(values / np.float32(np.iinfo(dtype).max), -1)
         return values
+
+
+def _check_drawing(extension: dict[str, Any]) -> None:
+    """Raises BadFileError for splats that are to be drawn in another way than ours."""
+    if extension.get("kernel") != "ellipse":
+        raise BadFileError("its splats have another kernel than ellipse")
+    if extension.get("colorSpace") != "srgb_rec709_display":
+        raise BadFileError("its colours are in another space than srgb_rec709_display")
 
 
 def _list(holder: dict[str, Any], key: str) -> list[Any]:

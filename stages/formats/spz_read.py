@@ -75,13 +75,19 @@ def read(path: Path) -> Splats:
     Raises BadFileError for a damaged file or another version.
     """
     with path.open("rb") as file:
-        streams = file.read(len(MAGIC)) == MAGIC
-        file.seek(0)
-        size = path.stat().st_size
-        head, extensions, arrays = _of_streams(file, size) if streams else _gzipped(file, size)
-        y_up = _is_y_up(extensions) if head.flags & _HAS_EXTENSIONS else True
-        splats = _decoded(head, arrays).with_antialias(bool(head.flags & ANTIALIASED))
-        return flipped(splats, reuse=True) if y_up else splats
+        splats, extensions = unpack(file, path.stat().st_size)
+    return flipped(splats, reuse=True) if _is_y_up(extensions) else splats
+
+
+def unpack(file: BinaryIO, size: int) -> tuple[Splats, bytes]:
+    """(the splats in the axes that they are stored in, the records of extensions) of an open file
+    of `size` bytes. Raises as `read`."""
+    file.seek(0)
+    streams = file.read(len(MAGIC)) == MAGIC
+    file.seek(0)
+    head, extensions, arrays = _of_streams(file, size) if streams else _gzipped(file, size)
+    splats = _decoded(head, arrays).with_antialias(bool(head.flags & ANTIALIASED))
+    return splats, extensions if head.flags & _HAS_EXTENSIONS else b""
 
 
 def _gzipped(file: BinaryIO, size: int) -> _Content:

@@ -45,6 +45,7 @@ CHECKS = {
     "usdc": _USD,
     "usdz": _USD,
     "quantised.glb": _GLTF,
+    "spz.glb": _GLTF,
     "compressed.ply": Checks(independent_packed.compressed_ply),
     "spz": _SPZ,
     "v4.spz": _SPZ,

@@ -69,7 +69,10 @@ def compressed_ply(path: Path) -> Splats:
 
 
 def spz(path: Path) -> Splats:
-    packed = path.read_bytes()
+    return spz_content(path.read_bytes())
+
+
+def spz_content(packed: bytes) -> Splats:
     content = _joined(packed) if packed.startswith(b"NGSP") else gzip.decompress(packed)
     magic, version, n, degree, fraction, flags = struct.unpack_from("<IIIBBB", content)
     assert magic == 0x5053474E, "the header does not begin with NGSP"

@@ -13,6 +13,7 @@ import math
 import tempfile
 import zlib
 from collections.abc import Callable
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -33,7 +34,7 @@ from stages.proof.content import (
     splats_by_rows,
     splats_of,
 )
-from stages.proof.independent_packed import compressed_ply
+from stages.proof.independent_packed import compressed_ply, spz_content
 from stages.scene import Splats
 
 _PLY_ROWS = 1 << 14  # columns are gathered from the cache
@@ -185,6 +186,14 @@ def gltf(path: Path) -> Splats:
     prefix = "KHR_gaussian_splatting:"
     parts = []
     for primitive in document.meshes[0].primitives if document.meshes else []:
+        compressions = primitive.extensions[prefix[:-1]].get("extensions", {})
+        if spz := compressions.get("KHR_gaussian_splatting_compression_spz_2"):
+            view = document.bufferViews[spz["bufferView"]]
+            content = buffers[view.buffer](view.byteOffset or 0, view.byteLength)
+            part = spz_content(content)
+            means, log_scales = scale * part.means, part.log_scales + np.float32(math.log(scale))
+            parts.append(replace(part, means=means, log_scales=log_scales))
+            continue
         coefficients = [
             f"{prefix}SH_DEGREE_{d}_COEF_{i}"
             for d in range(4)
@@ -205,7 +214,8 @@ def gltf(path: Path) -> Splats:
                 sh=sh,
             )
         )
-    antialias = (document.asset.extras or {}).get("antialiased", False)
+    packed_antialias = any(part.draw_settings.antialias for part in parts)
+    antialias = (document.asset.extras or {}).get("antialiased", packed_antialias)
     return concatenate(parts).with_antialias(antialias)
 
 

@@ -47,6 +47,7 @@ LOSSES = {
     "compressed.ply": (1e-3, 0.023),
     "spz": (6e-3, 0.04),
     "v4.spz": (6e-3, 0.04),
+    "spz.glb": (6e-3, 0.04),
     "sog": (2e-3, 1e-6),
 }
 

@@ -205,6 +205,7 @@ LAYERS: dict[str, Layer] = {
     "sog, a picture": _part("sog", "means_l.webp", text=False),
     "glb, document": _glb_document("glb"),
     "quantised.glb, document": _glb_document("quantised.glb"),
+    "spz.glb, document": _glb_document("spz.glb"),
     "html, unpacked": Layer("a.html", _html_inside, _html_with, text=True),
     **camera_layers.LAYERS,
     **photo_layers.LAYERS,

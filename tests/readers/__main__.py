@@ -123,7 +123,7 @@ def _readers(splats: Splats, folder: Path, names: list[str]) -> None:
 def _validators(folder: Path, names: list[str]) -> None:
     print("\n| format | validator | errors and warnings |\n|---|---|---|")
     for check, who, wanted in (
-        (gltf_complaints, "gltf-validator", ("glb", "gltf", "quantised.glb")),
+        (gltf_complaints, "gltf-validator", ("glb", "gltf", "quantised.glb", "spz.glb")),
         (usd_complaints, "usd-core", ("usda", "usdc", "usdz")),
     ):
         for name in (name for name in wanted if name in names):

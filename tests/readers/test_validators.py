@@ -18,7 +18,7 @@ from tests.readers.validators import gltf_complaints, usd_complaints
 pytestmark = pytest.mark.slow
 
 
-@pytest.mark.parametrize("suffix", ["glb", "gltf", "quantised.glb"])
+@pytest.mark.parametrize("suffix", ["glb", "gltf", "quantised.glb", "spz.glb"])
 @pytest.mark.parametrize("degree", [0, 3])
 @pytest.mark.usefixtures("packages")
 def test_gltf_files_are_valid(tmp_path: Path, suffix: str, degree: int) -> None:

@@ -50,6 +50,7 @@ def _shadow(path: Path, folder: Path) -> Path:
         content, binary = content[20 : 20 + size], content[20 + size :]
     document = json.loads(content)
     del document["extensionsUsed"]
+    document.pop("extensionsRequired", None)
     for mesh in document["meshes"]:
         for primitive in mesh["primitives"]:
             del primitive["extensions"]

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from stages.formats import format_of
 from stages.proof.checks import read_back
 from stages.proof.content import Y_DOWN, Y_UP, FileContent, logits, splats_of
+from tests.formats.files import glb_parts
 from tests.packages import UnavailableError, installed, node
 
 HERE = Path(__file__).parent
@@ -32,8 +34,11 @@ class Reader:
 
 def _gsply(path: Path) -> FileContent:
     gsply: Any = _imported("gsply")
-    spz = path.suffix == ".spz"
-    data = gsply.read_spz(path) if spz else gsply.plyread(path)
+    if path.suffix == ".ply":
+        data = gsply.plyread(path)
+    else:
+        with _spz_in(path) as spz:
+            data = gsply.read_spz(spz)
     rest = data.shN if data.shN is not None else np.zeros((len(data.means), 0, 3))
     return FileContent(
         splats_of(
@@ -105,9 +110,9 @@ def _splat_transform(path: Path) -> FileContent:
 
 def _adobe_spz(path: Path) -> FileContent:
     """Colours there are DC coefficients already; SH are coefficient by coefficient, RGB last."""
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, _spz_in(path) as spz:
         out = Path(folder) / "values"
-        said = node().run(HERE / "scripts" / "spz.mjs", installed(HERE), path, out)
+        said = node().run(HERE / "scripts" / "spz.mjs", installed(HERE), spz, out)
         about = json.loads(said.splitlines()[-1])  # the library talks too
         count, bands = about["count"], (about["degree"] + 1) ** 2 - 1
         flat = np.fromfile(out, "<f4")
@@ -126,6 +131,22 @@ def _adobe_spz(path: Path) -> FileContent:
     )
 
 
+@contextmanager
+def _spz_in(path: Path) -> Iterator[Path]:
+    """The .spz that a .glb holds, or a .spz itself."""
+    if path.suffix != ".glb":
+        yield path
+        return
+    document, binary = glb_parts(path)
+    primitive = document["meshes"][0]["primitives"][0]
+    (compression,) = primitive["extensions"]["KHR_gaussian_splatting"]["extensions"].values()
+    view = document["bufferViews"][compression["bufferView"]]
+    with tempfile.TemporaryDirectory() as folder:
+        payload = Path(folder) / "payload.spz"
+        payload.write_bytes(binary[: view["byteLength"]])
+        yield payload
+
+
 def _axes(path: Path) -> NDArray[np.float64]:
     return Y_UP if format_of(path).y_up else Y_DOWN
 
@@ -141,15 +162,15 @@ def _imported(name: str) -> Any:
 
 READERS = (
     Reader("plyfile", ("ply",), read_back),
-    Reader("pygltflib", ("glb", "gltf", "quantised.glb"), read_back),
+    Reader("pygltflib", ("glb", "gltf", "quantised.glb", "spz.glb"), read_back),
     Reader("usd-core", ("usda", "usdc", "usdz"), read_back),
-    Reader("gsply", ("ply", "compressed.ply", "spz", "v4.spz"), _gsply),
+    Reader("gsply", ("ply", "compressed.ply", "spz", "v4.spz", "spz.glb"), _gsply),
     Reader("tinyusdz", ("usda", "usdc", "usdz"), _tinyusdz),
     Reader(
         "splat-transform",
         ("ply", "splat", "compressed.ply", "spz", "v4.spz", "sog", "lod-meta.json"),
         _splat_transform,
     ),
-    Reader("@adobe/spz", ("spz", "v4.spz"), _adobe_spz),
+    Reader("@adobe/spz", ("spz", "v4.spz", "spz.glb"), _adobe_spz),
     Reader("Open3D", ("ply", "splat", "spz", "v4.spz"), _open3d),
 )
