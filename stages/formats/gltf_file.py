@@ -120,7 +120,7 @@ def _document(
 
 
 def _compress(document: dict[str, Any], size: int) -> None:
-    """Let a payload of `size` bytes stand for the attributes of the only primitive. CesiumJS 1.146
+    """Let a payload of `size` bytes stand for the attributes of the only primitive. CesiumJS 1.145
     takes it from the first buffer view, whichever is named."""
     for accessor in document["accessors"]:
         del accessor["bufferView"]

@@ -4,7 +4,7 @@ The splats are one .spz of version 3 in a buffer view: the extension asks for wh
 SPZ library reads. Accessors without a buffer view describe its values. Both extensions are
 required, because a viewer without them would show all points at one place.
 
-The text of the draft turns the axes of SPZ (right, up, back) to left, up, front. CesiumJS 1.146,
+The text of the draft turns the axes of SPZ (right, up, back) to left, up, front. CesiumJS 1.145,
 the implementation that it names, leaves values as they are stored; so do we, and such a file stands
 as a .glb does. Specification: KhronosGroup/glTF, pull request 2531.
 """
