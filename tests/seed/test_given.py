@@ -17,8 +17,9 @@ from stages.raster.draw import render
 from stages.raster.similarity import Similarity, rotation_about
 from stages.scene import DrawSettings, Splats
 from stages.seed import stage
-from stages.seed.given import NERFSTUDIO, given_splats
+from stages.seed.given import given_splats
 from stages.seed.settings import SeedSettings
+from stages.seed.worlds import NERFSTUDIO
 from tests.small_scene import SmallScene, small_scene
 
 TO_FILE = Similarity(2.5, rotation_about(np.array([1.0, 2.0, 0.5]), 70), np.array([3.0, -8.0, 1.0]))
