@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from inspect import Parameter
 from typing import Any
 
@@ -115,7 +116,7 @@ def combined(
     """
     chosen = dict(base)
     if preset is not None and "train" in chosen:
-        chosen["train"] = PRESETS[preset]
+        chosen["train"] = replace(PRESETS[preset], splats=chosen["train"].splats)
     if given.get("splats") not in (None, UNSET) and "steps" not in given:
         given = {**given, "steps": 0}
     new = {

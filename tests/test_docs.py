@@ -32,6 +32,7 @@ _NO_CODES = {
     "no-referrer",
     *("drop-floaters", "max-mb"),  # operations of `splat edit`
     *("utf-8", "utf-8-sig", "no-store", "same-origin"),  # encodings, headers
+    "2-sfm",  # a folder
     "allow-nonfinite",  # an argument of the USD reader's process
     *("in-use", "peak-memory"),  # parts of file names
     *("no-rotation", "too-large"),  # flags of `splat info`

@@ -10,13 +10,14 @@ from splatcli import console, log, options, progress, run_result, run_settings
 from splatcli.arguments import Cluster, Out, Photos, Run
 from splatcli.folders import DEFAULT, find_run_folder, run_folder_for
 from stages.base.errors import UsageError
-from stages.base.settings import changed
+from stages.base.settings import UNSET, changed
 from stages.cameras.camera_formats import read_cameras
 from stages.run import runfolder
+from stages.run.branch import branch
 from stages.run.listener import Listener, Listeners
 from stages.run.pipeline import Pipeline
 from stages.run.stages import STAGE_NAMES
-from stages.seed.settings import check_given
+from stages.seed.settings import SPLATS_OF_A_STAGE, check_given
 from stages.sfm.known.match_cameras import check_split
 from stages.viewer.live_training import LiveTraining
 from stages.viewer.server import open_in_browser
@@ -41,6 +42,9 @@ def process(
     view, preset = given.pop("view", False), given.pop("preset", None)
     if "formats" in given:
         given["formats"] = pipeline.with_exported(given["formats"])
+    splats = given.get("splats", UNSET)
+    if splats is not UNSET and runfolder.is_run_folder(splats):
+        given["splats"] = _trained_splats(splats, run_folder)
     is_known = runfolder.is_run_folder(run_folder)
     settings = run_settings.combined(run_settings.recorded(pipeline), given, preset)
     sfm = settings["sfm"]
@@ -70,24 +74,44 @@ def _run_folder_and_photos(photos: Path | None, out: Path | None) -> tuple[Path,
     """(run folder, photographs or None) of a command's arguments.
 
     Photographs start or continue the run folder `out`, or `run_folder_for` them; a run folder in
-    their place, or nothing, continues with the recorded settings. Raises SplatError.
+    their place, or nothing, continues with the recorded settings. A run folder and another `out`
+    start or continue a second run that begins as the first. Raises SplatError, OSError.
     """
     if photos is None:
         return find_run_folder(out), None
     if runfolder.is_run_folder(photos):
-        if out is not None and out.absolute() != photos.absolute():
+        if out is None or out.resolve() == photos.resolve():
+            return photos, None
+        if not runfolder.is_run_folder(out):
+            branch(photos, out)
+        elif Pipeline(out).recorded_photos() != Pipeline(photos).recorded_photos():
             raise UsageError(
                 "option-out",
-                given=f"{photos} is itself a run folder, and --out names {out}.",
-                wanted="Photographs to start from, or one run folder to continue.",
+                given=f"{photos} and {out} are runs of different photographs.",
+                wanted=f"A new folder, for a run that begins as {photos}, or one made so.",
                 hint=f"Leave --out away to continue {photos}.",
             )
-        return photos, None
+        return out, None
     folder = out or run_folder_for(photos)
     runfolder.check_photos(folder, photos)  # before anything is said of the run
     if out is None and folder != DEFAULT and console.mode.has_notes:
         console.note(f"Run folder: {folder}, since {DEFAULT} holds a run of other photographs.")
     return folder, photos
+
+
+def _trained_splats(run: Path, run_folder: Path) -> Path:
+    """The splats of the finished training of `run`, for `run_folder` to start from. Raises
+    SplatError."""
+    if run.resolve() == run_folder.resolve():
+        raise UsageError(
+            "option-out",
+            given=f"{run} would start from its own splats, and training replaces them.",
+            wanted="A folder of its own for the run that goes on from them.",
+            hint=f"splat process {run} --out NEW --splats {run} --steps 3000",
+        )
+    earlier = Pipeline(run)
+    earlier.load("train")  # raises if it has not finished, or is damaged
+    return earlier.stage_folder("train") / SPLATS_OF_A_STAGE
 
 
 def _run_stage(name: str, pipeline: Pipeline, given: Mapping[str, Any]) -> None:

@@ -6,7 +6,7 @@ import errno
 from pathlib import Path
 
 from stages.base.disk import DISK_FULL, disk_full, is_full, not_permitted
-from stages.base.errors import Family, ResourceError, SplatError
+from stages.base.errors import Family, ResourceError, RunFolderError, SplatError
 from stages.base.text import printable, printable_name, reason_of
 
 _DENIED = {errno.EACCES, errno.EPERM, errno.EROFS}
@@ -54,6 +54,16 @@ def as_splat_error(error: BaseException, doing: str, folder: Path) -> SplatError
         if isinstance(link, MemoryError) or any(w in str(link).lower() for w in _MEMORY_WORDS):
             return out_of_memory(doing, link)
     return disk_full(doing, folder) if full else None
+
+
+def unusable(error: OSError, run_folder: Path) -> SplatError:
+    """The error for a run folder that the system refuses to make or to write to."""
+    return as_splat_error(error, "the run", run_folder) or RunFolderError(
+        "run-folder-unusable",
+        given=f"{error.filename or run_folder}: {error.strerror or error}.",
+        wanted="A run folder that can be made and written to.",
+        hint="Check the path, or name another folder with --out.",
+    )
 
 
 def _unusable_name(code: str, given: str) -> SplatError:

@@ -18,7 +18,7 @@ from stages.base.stage import Stage
 from stages.run import runfolder
 from stages.run.attempt import attempt
 from stages.run.digests import damage
-from stages.run.failures import as_splat_error
+from stages.run.failures import as_splat_error, unusable
 from stages.run.listener import Listener
 from stages.run.lock import holder
 from stages.run.manifest import Manifest
@@ -137,7 +137,7 @@ class Pipeline:
         try:
             return Planner(self.layout, photos, wanted).plan()
         except OSError as error:
-            raise self._unusable(error) from error
+            raise unusable(error, self.run_folder) from error
 
     def run(
         self,
@@ -184,7 +184,7 @@ class Pipeline:
                 forget = partial(self._forget, before, run_file)
                 return self._run_all(planner, until, stopped, listener, forget)
         except OSError as error:
-            raise self._unusable(error) from error
+            raise unusable(error, self.run_folder) from error
         finally:
             listener.ended()
 
@@ -265,12 +265,4 @@ class Pipeline:
             wanted="Every earlier stage finished and unchanged.",
             hint=f"Run `splat {name} {folder}` first, or `splat process {folder}` for everything "
             "that is missing.",
-        )
-
-    def _unusable(self, error: OSError) -> SplatError:
-        return as_splat_error(error, "the run", self.run_folder) or RunFolderError(
-            "run-folder-unusable",
-            given=f"{error.filename or self.run_folder}: {error.strerror or error}.",
-            wanted="A run folder that can be made and written to.",
-            hint="Check the path, or name another folder with --out.",
         )

@@ -251,7 +251,7 @@ def geometric_median(points: NDArray[np.float64]) -> NDArray[np.float64]:
     middle = points.mean(axis=0)
     for _ in range(50):
         away = np.linalg.norm(points - middle, axis=1)
-        weights = 1.0 / np.maximum(away, 1e-9 * away.max(initial=1e-300))
+        weights = 1.0 / np.maximum(away, 1e-9 * away.max() + 1e-150)
         middle = weights @ points / weights.sum()
     return np.asarray(middle)
 

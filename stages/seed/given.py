@@ -1,9 +1,11 @@
-"""Splats that another program trained, in the run's world and drawn as that program draws them.
+"""Splats that another program or an earlier run trained, in the run's world and drawn as they were
+trained to be.
 
-A file says neither whether its splats were trained to be drawn with opacity compensation nor, for
-most formats, which world they are in. So each possible world is drawn at small pictures of training
-cameras, and the one that is nearest to the photographs is taken; then each drawing, at the size of
-the photographs, because the two differ least where a model was trained.
+The file of another program says neither whether its splats were trained to be drawn with opacity
+compensation nor, for most formats, which world they are in. So each possible world is drawn at
+small pictures of training cameras, and the one that is nearest to the photographs is taken; then
+each drawing, at the size of the photographs, because the two differ least where a model was
+trained.
 """
 
 from __future__ import annotations
@@ -22,48 +24,81 @@ from stages.evaluate.evaluation import EvaluationView, load_evaluation_views, me
 from stages.evaluate.image_metrics import psnr
 from stages.raster.backends import AUTO
 from stages.scene import Reconstruction, Splats, draw_settings_of, evenly_spaced, split_held_out
-from stages.seed.settings import check_given
-from stages.seed.worlds import NERFSTUDIO, World, worlds_of
+from stages.scene.storage import load_splats
+from stages.seed.settings import check_given, run_of
+from stages.seed.worlds import NERFSTUDIO, World, world_of_run, worlds_of
+from stages.sfm.reconstruction_files import load_reconstruction
 
+_SFM = "2-sfm"  # in the folder of a run
 _VIEWS, _SMALL = 6, 240  # that worlds are compared at; pixels
 _LARGE = 1600  # pixels at most of the drawings: what most programs train at
 
 
 def given_splats(path: Path, reconstruction: Reconstruction, report: Report) -> Splats:
-    """The splats of `path`, any format that is read.
+    """The splats of `path`: a file of any format that is read, or what a stage of a run wrote.
 
-    Raises SplatError as `check_given` and `formats.read`, and "seed-splats-do-not-fit" where a
-    picture of one colour is nearer to the photographs than any reading.
+    Raises SplatError as `check_given`, `formats.read` and `world_of_run`, and
+    "seed-splats-do-not-fit" where a picture of one colour is nearer to the photographs than any
+    reading.
     """
     check_given(path, reconstruction.file_from_world is not None)
-    splats, dropped = formats.read_drawable(path)
-    if dropped:
-        report.warn(
-            "seed-splats-dropped",
-            f"{counted(dropped, 'splat')} of {path.name} cannot be drawn and are left out.",
-        )
-    small, large = (_views(reconstruction, side, report) for side in (_SMALL, _LARGE))
-    worlds = worlds_of(path, reconstruction)
+    splats, worlds, drawings = _readings(path, reconstruction, report)
+    small = _views(reconstruction, _SMALL, report)
     by_world = []
     for number, world in enumerate(worlds):
         report.progress(number, len(worlds) + 1, f"trying {world.name}")
         moved = _moved(splats, world, reconstruction)
-        by_world.append(max(_db(moved, antialias, small) for antialias in (False, True)))
-    first, second, *_ = np.argsort(by_world)[::-1]
+        by_world.append(max(_db(moved, antialias, small) for antialias in drawings))
+    best, *others = np.argsort(by_world)[::-1]
     flat_db = float(np.mean([_flat_db(view) for view in small]))
-    if by_world[first] <= flat_db:
-        raise _do_not_fit(path, by_world[first], flat_db, worlds[first])
+    if by_world[best] <= flat_db:
+        raise _do_not_fit(path, by_world[best], flat_db, worlds[best])
+    report.metric("given_world", worlds[best].name)
+    report.metric("given_world_db", round(by_world[best], 3))
+    if others:
+        report.metric("next_world_db", round(by_world[others[0]], 3))
     report.progress(len(worlds), len(worlds) + 1, "trying plain and antialiased drawing")
-    found = _moved(splats, worlds[first], reconstruction)
-    drawn = {antialias: _db(found, antialias, large) for antialias in (False, True)}
-    antialias = drawn[True] > drawn[False]
-    report.metric("given_world", worlds[first].name)
-    report.metric("given_world_db", round(by_world[first], 3))
-    report.metric("next_world_db", round(by_world[second], 3))
+    found = _moved(splats, worlds[best], reconstruction)
+    large = _views(reconstruction, _LARGE, report)
+    by_drawing = sorted((_db(found, drawing, large), drawing) for drawing in drawings)[::-1]
+    (db, antialias), *next_best = by_drawing
     report.metric("given_drawing", "antialiased" if antialias else "plain")
-    report.metric("given_drawing_db", round(drawn[antialias], 3))
-    report.metric("other_drawing_db", round(drawn[not antialias], 3))
+    report.metric("given_drawing_db", round(db, 3))
+    if next_best:
+        report.metric("other_drawing_db", round(next_best[0][0], 3))
     return _drawn(found, antialias)
+
+
+def _readings(
+    path: Path, reconstruction: Reconstruction, report: Report
+) -> tuple[Splats, list[World], tuple[bool, ...]]:
+    """(the splats, the worlds that they may be in, whether they may be antialiased)."""
+    _, held_out = split_held_out(reconstruction.views)
+    run = run_of(path)
+    if run is None:
+        splats, dropped = formats.read_drawable(path)
+        if dropped:
+            report.warn(
+                "seed-splats-dropped",
+                f"{counted(dropped, 'splat')} of {path.name} cannot be drawn and are left out.",
+            )
+        _warn_of_held_out(len(held_out), "may have been", report)
+        return splats, worlds_of(path, reconstruction), (False, True)
+    splats, earlier = load_splats(path), load_reconstruction(run / _SFM)
+    training = {view.name for view in split_held_out(earlier.views)[0]}
+    if known := sum(view.name in training for view in held_out):
+        _warn_of_held_out(known, "were", report)
+    world = world_of_run(earlier, reconstruction)
+    return splats, [world], (splats.draw_settings.antialias,)
+
+
+def _warn_of_held_out(photographs: int, were: str, report: Report) -> None:
+    report.warn(
+        "seed-held-out-unknown",
+        f"The given splats {were} trained on {counted(photographs, 'photograph')} that this run "
+        "holds out: their PSNR is then no measure of other views. Held out is every eighth by "
+        "name, as in the papers, or with --split the test photographs of --cameras.",
+    )
 
 
 def _views(reconstruction: Reconstruction, side: int, report: Report) -> Sequence[EvaluationView]:

@@ -11,6 +11,8 @@ from stages.base.settings import setting
 from stages.base.stage import Stage, in_module
 from stages.formats.format_table import format_of
 
+SPLATS_OF_A_STAGE = "splats.bin"  # in the folder of a stage, as `scene.storage` names it
+
 
 @dataclass(frozen=True)
 class SeedSettings:
@@ -18,8 +20,8 @@ class SeedSettings:
 
     splats: Path | None = setting(
         None,
-        "Splats that another program trained with --cameras, in any format that is read: they take "
-        "the place of the first splats, and are not trained unless --steps asks for it.",
+        "Splats to start from, which are not trained unless --steps asks for it: what another "
+        "program trained with --cameras, in any format that is read, or an earlier run.",
         panel="Known cameras",
         affects_output=False,  # its content does, and that is an input
     )
@@ -35,9 +37,16 @@ STAGE = Stage(
 )
 
 
+def run_of(splats: Path) -> Path | None:
+    """The run folder whose stage wrote the file `splats`; None for that of another program."""
+    return splats.parent.parent if splats.name == SPLATS_OF_A_STAGE else None
+
+
 def check_given(path: Path, has_cameras: bool) -> None:
     """Raise SplatError for `--splats` that no run could use: "splats-unreadable" for a file that is
     not there, as `format_of`, and "seed-splats-without-cameras"."""
+    if run_of(path) is not None:
+        return
     with reading(path):
         format_of(path)
     if not has_cameras:

@@ -1,23 +1,28 @@
-"""The worlds that the splats of another program may be in, and the way from there to the run's.
+"""The worlds that given splats may be in, and the way from there to the run's.
 
-A file does not say which one it is: `given` draws the splats in each.
+The file of another program does not say which one it is: `given` draws the splats in each. That of
+an earlier run follows from the photographs that both runs have.
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import reading
+from stages.base.errors import SplatError
+from stages.base.text import counted
 from stages.raster.similarity import Similarity, rotation_to_up
 from stages.scene import Reconstruction
 
 NERFSTUDIO = "dataparser_transforms.json"  # beside the splats: how their world was normalised
 _FEWEST_POINTS = 4  # that have principal axes
+_FEWEST_SHARED = 3  # cameras that a similarity follows from
+_REWEIGHTED = 50  # times
 _FLIPS = tuple(np.diag(signs) for signs in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)))
 
 
@@ -50,6 +55,51 @@ def worlds_of(path: Path, reconstruction: Reconstruction) -> list[World]:
         world = to_run.after(normalised).after(Similarity(rotation=flip))
         worlds.append(World("gsplat's normalised world", world))
     return worlds
+
+
+def world_of_run(earlier: Reconstruction, reconstruction: Reconstruction) -> World:
+    """The world of an earlier run, from the cameras of the photographs that both runs have.
+
+    First the rotation and then scale and offset have the least sum of distances (not of their
+    squares) between the cameras, so that one that an attempt placed elsewhere does not count.
+    Raises SplatError "seed-splats-do-not-fit" where fewer than three photographs have the same
+    name in both.
+    """
+    cameras = {view.name: view.camera for view in reconstruction.views}
+    pairs = [(v.camera, cameras[v.name]) for v in earlier.views if v.name in cameras]
+    if len(pairs) < _FEWEST_SHARED:
+        raise SplatError(
+            "seed-splats-do-not-fit",
+            given=f"The run that trained the splats ({earlier.folder.parent}) and this one have "
+            f"{counted(len(pairs), 'photograph')} of the same name with a known camera.",
+            wanted=f"At least {_FEWEST_SHARED}, to bring the splats into this run's world.",
+            hint="Give the photographs of that run, with others added if you like.",
+        )
+    turns = np.array([n.world_to_camera[:3, :3].T @ o.world_to_camera[:3, :3] for o, n in pairs])
+    rotation, weights = np.eye(3), np.ones(len(pairs))
+    for _ in range(_REWEIGHTED):
+        left, _, right = np.linalg.svd(np.einsum("v,vij->ij", weights, turns))
+        rotation = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+        weights = _inverse(np.linalg.norm(turns - rotation, axis=(1, 2)))
+    old, new = (np.array([pair[k].centre for pair in pairs]) for k in (0, 1))
+    old, weights = old @ rotation.T, np.ones(len(pairs))
+    for _ in range(_REWEIGHTED):
+        middles = [weights @ centres / weights.sum() for centres in (old, new)]
+        apart, apart_new = old - middles[0], new - middles[1]
+        scale = float((weights @ (apart * apart_new).sum(1)) / (weights @ (apart**2).sum(1)))
+        offset = middles[1] - scale * middles[0]
+        weights = _inverse(np.linalg.norm(new - scale * old - offset, axis=1))
+    in_means = Similarity(scale, rotation, offset)
+    # cameras and means are relative to each run's own origin; `given` moves what includes it
+    return World(
+        "the earlier run's world",
+        replace(in_means, offset=offset - scale * rotation @ earlier.origin),
+    )
+
+
+def _inverse(residuals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Weights by which least squares find the least sum of residuals (Weiszfeld 1937)."""
+    return np.asarray(1.0 / np.maximum(residuals, 1e-9 * residuals.max() + 1e-150))
 
 
 def _of_opensplat(reconstruction: Reconstruction) -> Similarity:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 
 from stages.base.stage import Report
@@ -12,8 +13,8 @@ from stages.raster.backends import backend_of
 from stages.scene import Reconstruction, Splats, draw_settings_of, split_held_out, training_extent
 from stages.scene.light import spread_ev
 from stages.train.camera_refinement import CameraRefinement
-from stages.train.cap import cap_for, splats_determined
-from stages.train.schedule import LAST_PART, Schedule
+from stages.train.cap import DEVICE_MEMORY, cap_for, splats_determined
+from stages.train.schedule import DENSIFYING_PART, LAST_PART, Schedule
 from stages.train.settings import TrainSettings
 from stages.train.trainer import Trainer, TrainingTask
 from stages.train.views import load_views
@@ -28,8 +29,8 @@ def make_trainer(
 ) -> Trainer:
     """Load the training views and choose the cap of splats. Raises SplatError.
 
-    start: what another program trained keeps its SH degree, its drawing and all its splats, and
-    gets the last part of a run.
+    start: what was trained before keeps its drawing, its SH degree at least, and all its splats.
+    It gets the last part of a run, or the part that densifies, too.
     """
     began = time.monotonic()
     kept, held = split_held_out(reconstruction.views)
@@ -37,12 +38,15 @@ def make_trainer(
     train = load_views(reconstruction.folder, kept, settings.train_side, folder, light)
     given = settings.splats is not None
     antialias = start.draw_settings.antialias if given else settings.antialias
-    sh_degree = start.sh_degree if given else settings.sh_degree
+    sh_degree = max(settings.sh_degree if settings.steps else 0, start.sh_degree)
     draw_settings = draw_settings_of(reconstruction.views, settings.train_side, light, antialias)
     held_out = load_evaluation_views(reconstruction.folder, held, draw_settings)
     _warn_of_small_photographs(reconstruction, settings.train_side, report)
     determined = splats_determined([view.levels[-1].camera for view in train], sh_degree)
-    cap = cap_for(folder, len(start) if given else settings.max_splats, determined)
+    since = _part(settings)
+    cap = cap_for(folder, len(start) if since == LAST_PART else settings.max_splats, determined)
+    if given and cap.origin != DEVICE_MEMORY:
+        cap = replace(cap, splats=max(cap.splats, len(start)))
     report.metric("splat_cap_free_mib", cap.free_mib)
     extent, backend = training_extent(reconstruction), settings.backend
     refinement = None
@@ -70,9 +74,16 @@ def make_trainer(
         sh_degree=sh_degree,
         n_start=min(len(start), cap.splats),
         seed=settings.seed,
-        since=LAST_PART if given else (0, 0.0),
+        since=since,
     )
     return Trainer(task, schedule, cap, refinement)
+
+
+def _part(settings: TrainSettings) -> tuple[int, float]:
+    """`Schedule.since` of the run."""
+    if settings.splats is None:
+        return 0, 0.0
+    return DENSIFYING_PART if settings.densify or settings.within else LAST_PART
 
 
 def _warn_of_small_photographs(

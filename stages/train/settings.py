@@ -98,9 +98,16 @@ class TrainSettings:
     backend: str = backend_setting()
     splats: Path | None = setting(
         None,
-        "The splats of `splat seed` are those of this file of another program: only the last part "
+        "The splats of `splat seed` are given ones, which were trained before: only the last part "
         "of a training is made.",
         affects_output=False,  # its content does, and that is an input
+    )
+    densify: bool = setting(
+        False,
+        "Go on from --splats with more splats: from the second fifth of a run on, which densifies, "
+        "to at most --max-splats. --within does so, too, inside its rectangle.",
+        panel="Size",
+        needs="splats",
     )
 
     @property
@@ -117,7 +124,7 @@ PRESETS: dict[str, TrainSettings] = {
 
 STAGE = Stage(
     "train",
-    version=35,
+    version=36,
     reads=("sfm", "seed"),
     settings_type=TrainSettings,
     **in_module("stages.train.stage"),

@@ -125,13 +125,6 @@ def _report_task(task: TrainingTask, settings: TrainSettings, report: Report) ->
     report_backend(report, task.backend)
     report.metric("device", report.device)
     report.metric("unavailable_backends", unavailable_backends(settings.backend))
-    if settings.splats is not None:
-        report.warn(
-            "train-held-out-unknown",
-            "The given splats may have been trained on the photographs that are held out here: "
-            "their PSNR is then no measure of other views. Every eighth by name is held out, as in "
-            "the papers, or the test photographs of --cameras with --split.",
-        )
     report.metric("training_views", len(task.views))
     report.metric("held_out_views", len(task.held_out))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import sys
 import time
 import warnings
@@ -537,8 +538,20 @@ def test_render_refuses_what_is_not_a_picture_or_a_run(splat) -> None:
     assert "splat process" in early.stderr
 
 
-def test_option_out_of_two_run_folders_is_refused(splat) -> None:
+def test_a_run_folder_and_another_out_make_a_second_run_that_begins_as_the_first(splat) -> None:
+    splat("process", "photos", "--steps", "70")
+    second = splat("process", "run", "--out", "other", "--steps", "80", "--json")
+    assert started(second)[0] == "train"
+    again = splat("process", "run", "--out", "other", "--steps", "80", "--json")
+    assert again.exit_code == 0
+    assert started(again) == []
+    assert started(splat("process", "run", "--json")) == []
+
+
+def test_runs_of_different_photographs_do_not_go_on_from_each_other(splat) -> None:
     splat("process", "photos")
+    shutil.copytree("photos", "photos2")
+    splat("process", "photos2", "--out", "other")
     result = splat("process", "run", "--out", "other")
     assert result.exit_code == 2
     assert "--out" in result.stderr

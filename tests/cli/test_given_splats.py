@@ -9,6 +9,8 @@ import pytest
 from splatcli import run_settings
 from stages import formats
 from stages.base.errors import SplatError
+from stages.run.pipeline import Pipeline
+from stages.train.settings import PRESETS
 from tests.scenes import splats as some_splats
 
 
@@ -46,3 +48,34 @@ def test_one_stage_alone_does_not_take_given_splats(splat, given: Path) -> None:
         result = splat(stage, "run", "--splats", str(given))
         assert result.exit_code == 2
         assert "splat process run --splats" in result.stderr
+
+
+def test_a_run_is_no_start_for_itself(splat) -> None:
+    assert splat("process", "photos").exit_code == 0
+    result = splat("process", "photos", "--splats", "run")
+    assert result.exit_code == 2
+    assert "--out NEW" in result.stderr
+
+
+def test_a_run_goes_on_from_the_splats_of_another(splat) -> None:
+    assert splat("process", "photos").exit_code == 0
+    result = splat("process", "run", "--out", "second", "--splats", "run", "--steps", "9")
+    assert result.exit_code == 0, result.stderr
+    found = Pipeline(Path("second")).recorded_settings()
+    assert found["train"].steps == 9
+    trained = Path("run/4-train/splats.bin").absolute()
+    assert found["seed"].splats == found["train"].splats == trained
+
+
+def test_an_unfinished_run_is_no_start(splat) -> None:
+    assert splat("ingest", "photos", "--out", "early").exit_code == 0
+    result = splat("process", "photos", "--out", "second", "--splats", "early")
+    assert result.exit_code == 2
+    assert "stage-not-finished" in result.stderr
+
+
+def test_a_preset_keeps_the_given_splats(given: Path) -> None:
+    base = run_settings.of_new_run({"splats": given})
+    found = run_settings.combined(base, {}, "best")["train"]
+    assert found.splats == given
+    assert found.steps == PRESETS["best"].steps

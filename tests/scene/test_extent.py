@@ -78,3 +78,7 @@ def test_a_walk_longer_than_what_it_sees_is_its_own_measure():
 def test_without_points_in_any_picture_the_cameras_tell(points):
     bare = held_still(0.5, points)
     assert training_extent(bare) == scene_extent(bare.views[1:])
+
+
+def test_cameras_at_one_place_have_the_smallest_extent() -> None:
+    assert scene_extent(standing_at(np.ones((4, 3)))) == 1e-6

@@ -1,4 +1,5 @@
-"""Splats of other programs: brought into the run's world, and read as they were trained."""
+"""Splats of other programs and runs: brought into this run's world, and read as they were
+trained."""
 
 from __future__ import annotations
 
@@ -16,10 +17,12 @@ from stages.base.stage import Report
 from stages.raster.draw import render
 from stages.raster.similarity import Similarity, rotation_about
 from stages.scene import DrawSettings, Splats
+from stages.scene.storage import save_splats
 from stages.seed import stage
 from stages.seed.given import given_splats
 from stages.seed.settings import SeedSettings
 from stages.seed.worlds import NERFSTUDIO
+from stages.sfm.reconstruction_files import load_reconstruction, save_reconstruction
 from tests.small_scene import SmallScene, small_scene
 
 TO_FILE = Similarity(2.5, rotation_about(np.array([1.0, 2.0, 0.5]), 70), np.array([3.0, -8.0, 1.0]))
@@ -182,4 +185,74 @@ def test_what_cannot_be_drawn_is_left_out_and_said(scene: SmallScene, tmp_path: 
     report = Report()
     found = given_splats(path, scene.reconstruction, report)
     assert len(found) == len(scene.splats) - 1
-    assert [code for code, _ in report.warnings] == ["seed-splats-dropped"]
+    assert [code for code, _ in report.warnings] == [
+        "seed-splats-dropped",
+        "seed-held-out-unknown",
+    ]
+
+
+def earlier_run(folder: Path, scene: SmallScene, moved: Similarity) -> Path:
+    """The splats that a run trained whose world is `moved`; its camera of the first photograph is
+    wrong, and it did not hold out the ninth."""
+    views = [replace(v, camera=moved.apply_to_camera(v.camera)) for v in scene.reconstruction.views]
+    views[0] = replace(views[0], camera=views[1].camera)
+    origin = np.array([7.0, 8.0, 9.0])
+    (folder / "2-sfm").mkdir(parents=True)
+    (folder / "4-train").mkdir()
+    reconstruction = replace(
+        scene.reconstruction, views=tuple(views), origin=origin, points=np.zeros((0, 3))
+    )
+    save_reconstruction(folder / "2-sfm", reconstruction)
+    splats = moved.apply_to_splats(scene.splats)
+    means = (splats.means + splats.origin).astype(np.float32)
+    drawn = DrawSettings(antialias=True)
+    splats = replace(splats, means=means, origin=origin, draw_settings=drawn)
+    return save_splats(folder / "4-train", splats)
+
+
+def test_the_world_of_an_earlier_run_follows_from_the_shared_photographs(
+    scene: SmallScene, tmp_path: Path
+) -> None:
+    """One of the ten cameras was placed wrongly there, and does not count."""
+    path, report = earlier_run(tmp_path / "run", scene, TO_FILE), Report()
+    estimated = replace(scene.reconstruction, file_from_world=None)
+    found = given_splats(path, estimated, report)
+    check_same(found, scene.splats)
+    np.testing.assert_array_equal(found.origin, estimated.origin)
+    assert found.draw_settings.antialias
+    assert report.metrics["given_world"] == "the earlier run's world"
+    assert "other_drawing_db" not in report.metrics
+
+
+def test_equal_cameras_give_equal_splats(scene: SmallScene, tmp_path: Path) -> None:
+    path = earlier_run(tmp_path / "run", scene, TO_FILE)
+    moved = [
+        replace(v, camera=TO_FILE.apply_to_camera(v.camera)) for v in scene.reconstruction.views
+    ]
+    own = load_reconstruction(tmp_path / "run" / "2-sfm")
+    save_reconstruction(tmp_path / "run" / "2-sfm", replace(own, views=tuple(moved)))
+    check_same(given_splats(path, scene.reconstruction, Report()), scene.splats)
+
+
+def test_held_out_photographs_that_the_earlier_run_trained_on_are_said(
+    scene: SmallScene, tmp_path: Path
+) -> None:
+    path, report = earlier_run(tmp_path / "run", scene, Similarity()), Report()
+    given_splats(path, scene.reconstruction, report)
+    assert report.warnings == []
+    views = scene.reconstruction.views
+    changed = tuple(replace(v, role="test" if v.name == "03.png" else "train") for v in views)
+    given_splats(path, replace(scene.reconstruction, views=changed), report)
+    assert "1 photograph " in dict(report.warnings)["seed-held-out-unknown"]
+
+
+def test_an_earlier_run_of_other_photographs_is_refused(scene: SmallScene, tmp_path: Path) -> None:
+    path = earlier_run(tmp_path / "run", scene, Similarity())
+    renamed = (
+        view if i < 2 else replace(view, name=f"b{view.name}")
+        for i, view in enumerate(scene.reconstruction.views)
+    )
+    with pytest.raises(SplatError) as caught:
+        given_splats(path, replace(scene.reconstruction, views=tuple(renamed)), Report())
+    assert caught.value.code == "seed-splats-do-not-fit"
+    assert "2 photographs" in caught.value.given
