@@ -67,6 +67,11 @@ FORMAT_CELLS = (
         "as `sog`, in chunks and levels of detail; written by `splat edit`",
     ),
     (
+        ("tileset.json",),
+        "CesiumJS: 3D Tiles on the globe",
+        "as `spz.glb`, in tiles of levels of detail; written by `splat edit`",
+    ),
+    (
         ("html",),
         "any browser, from disk, without a network",
         "everything; also the viewer and the cameras",

@@ -135,11 +135,12 @@ def _items(
     target: Path | None, pipeline: Pipeline | None, splats: Splats, content: Path
 ) -> dict[str, Item | Response]:
     """The items to serve. The splats are written to `content` as .ply, which the page reads best;
-    a streamed asset is served as it is."""
+    a lod-meta.json is served as it is."""
     run = pipeline or results.run_around(target)
     sfm = run.load("sfm") if run is not None and run.manifest("sfm") is not None else None
     units = sfm.units if sfm else "arbitrary"
-    if pipeline is None and target is not None and format_of(target).streamed:
+    row = format_of(target) if pipeline is None and target is not None else None
+    if target is not None and row is not None and row.streamed and row.takes_views:
         content = target
     else:
         ply.write(content, splats, units=units)

@@ -24,6 +24,7 @@ from stages.formats import (
     spz,
     spz_read,
     streamed_sog,
+    tileset,
     usd,
     usd_read,
 )
@@ -43,6 +44,8 @@ class Codec:
             whose files declare them in text at their start, or not at all.
         order: (splats) -> [N] the row of `splats` that each row of the file comes from; None if the
             format keeps the order.
+        parts: (path) -> by relative path, all files of a streamed asset.
+        move: (from, to) moves a streamed asset, which replaces the one there.
         positions: how positions are held, as the end of "the format ...".
         log_sizes: the least and the greatest ln of a standard deviation that it holds.
         most_sh: the largest magnitude of a coefficient above degree 0 that it holds.
@@ -52,6 +55,8 @@ class Codec:
     read: Callable[[Path], Splats]
     units: Callable[[Path], str] | None = None
     order: Callable[[Splats], NDArray[np.intp]] | None = None
+    parts: Callable[[Path], dict[str, Path]] | None = None
+    move: Callable[[Path, Path], None] | None = None
     positions: str = "holds positions of 32 bits, in coarser steps the farther from zero they are"
     log_sizes: tuple[float, float] = (-math.inf, math.inf)
     most_sh: float = math.inf
@@ -110,8 +115,18 @@ CODECS = {
         streamed_sog.write,
         streamed_sog.read,
         order=streamed_sog.order,
+        parts=streamed_sog.parts_of,
+        move=streamed_sog.move,
         positions="holds positions of 16 bits in the range of each chunk",
         log_sizes=_SIZES,
+    ),
+    "tileset.json": replace(
+        _SPZ,
+        write=tileset.write,
+        read=tileset.read,
+        order=tileset.order,
+        parts=tileset.parts_of,
+        move=tileset.move,
     ),
     "html": Codec(html.write, html.read),
 }

@@ -37,6 +37,7 @@ class Format:
         says_drawing: whether a file says that its splats are to be drawn so.
         streamed: whether the asset has levels of detail. Its file name is `ending` alone, its
             chunks lie in folders beside it, and a folder holds one such asset.
+        on_globe: whether programs put it where it lies on the earth.
     """
 
     ending: str
@@ -51,6 +52,7 @@ class Format:
     drawn_antialiased: bool = False
     says_drawing: bool = True
     streamed: bool = False
+    on_globe: bool = False
 
     def matches(self, name: str) -> bool:
         """Whether a file of this lower-case name is of this format."""
@@ -71,10 +73,11 @@ class Format:
         page = path.with_suffix(self.sidecar) if self.sidecar else path
         beside = [path, page] if page != path and page.is_file() else [path]
         if self.streamed:
-            from stages.formats import streamed_sog  # it loads NumPy, which the table does without
+            from stages.formats.codecs import CODECS  # they load NumPy, the table does without
 
-            chunks = set(streamed_sog.parts_of(path).values()) - set(beside)
-            return [*beside, *sorted(chunks)]
+            parts = CODECS[self.ending].parts
+            assert parts is not None
+            return [*beside, *sorted(set(parts(path).values()) - set(beside))]
         return beside
 
     def size_bytes(self, path: Path) -> int:
@@ -139,6 +142,13 @@ TABLE = (
         sidecar=".html",
         takes_views=True,
         streamed=True,
+    ),
+    Format(
+        "tileset.json",
+        loses="has sizes in steps of 6 %, 8-bit colours and view-dependent colour of 4 and 5 bits",
+        y_up=True,
+        streamed=True,
+        on_globe=True,
     ),
     Format("html", takes_views=True, drawn_antialiased=True),
 )

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from stages.base.atomic import remove_abandoned_files, sync_folder, temporary_beside
 from stages.base.errors import SplatError, UsageError
-from stages.formats import streamed_sog
+from stages.formats.codecs import CODECS
 from stages.formats.format_table import format_of
 from stages.formats.offset import offset_path
 
@@ -24,8 +24,8 @@ def replacing_asset(path: Path) -> Iterator[Path]:
     remove_abandoned_files(path.parent)
     with temporary_beside(path) as temporary:
         yield temporary
-        if row.streamed:
-            return streamed_sog.move(temporary, path)
+        if move := CODECS[row.ending].move:
+            return move(temporary, path)
         beside = offset_path(temporary)
         if not row.holds_origin and not beside.exists():
             offset_path(path).unlink(missing_ok=True)

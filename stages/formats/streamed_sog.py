@@ -20,7 +20,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from stages.base.atomic import make_folder, replacing, temporary_beside
 from stages.base.bad_files import BadFileError, reading
@@ -235,14 +235,15 @@ def _write_chunk(folder: Path, splats: Splats, units: str) -> None:
 def _described(part: _Tree, levels: Sequence[Splats]) -> dict[str, Any]:
     """The tree for lod-meta.json, with the bounding box of the ellipsoids of each node."""
     if isinstance(part, _Leaf):
-        boxes = [_box(levels[i], rows) for i, rows in enumerate(part.rows) if len(rows)]
+        boxes = [bounding_box(levels[i], rows) for i, rows in enumerate(part.rows) if len(rows)]
         return {"bound": _around(boxes), "lods": part.lods}
     children = [_described(side, levels) for side in part]
     ends = [(c["bound"]["min"], c["bound"]["max"]) for c in children]
     return {"bound": _around(ends), "children": children}
 
 
-def _box(splats: Splats, rows: _Rows) -> tuple[list[float], list[float]]:
+def bounding_box(splats: Splats, rows: _Rows) -> tuple[list[float], list[float]]:
+    """(low, high) of the ellipsoids of some rows."""
     lows, highs = [], []
     for part in row_slices(len(rows)):
         some = rows[part]
@@ -276,7 +277,7 @@ def read(path: Path) -> Splats:
     chunks = [(names[file], wanted) for file, wanted in sorted(rows.items())]
     if meta.get("environment"):
         chunks.append((meta["environment"], None))
-    places = [_place(path.parent, name) for name, _ in chunks]
+    places = [beside(path.parent, name) for name, _ in chunks]
     if len(set(places)) < len(places):
         raise BadFileError("it names a chunk twice")
     sources = [_source(place) for place in places]
@@ -325,7 +326,7 @@ def parts_of(path: Path) -> dict[str, Path]:
     with reading(path):
         meta = json.loads(path.read_text(encoding="utf-8"))
         for name in [*meta["filenames"], *filter(None, [meta.get("environment")])]:
-            place = _place(path.parent, name)
+            place = beside(path.parent, name)
             chunk = place.parent.iterdir() if place.name == "meta.json" else [place]
             files = (file for file in chunk if file.is_file())
             parts |= {file.relative_to(path.parent).as_posix(): file for file in files}
@@ -343,6 +344,12 @@ def splat_widths(path: Path, finest: Splats) -> list[float]:
         for lods in _leaf_lods(meta["tree"]):
             for level, at in lods.items():
                 counts[int(level)] += at["count"]
+    return level_widths(counts, finest)
+
+
+def level_widths(counts: ArrayLike, finest: Splats) -> list[float]:
+    """As `splat_widths`, of levels with these numbers of splats."""
+    counts = np.asarray(counts, np.float64)
     if not len(finest):
         return [0.0] * len(counts)
     width = 2 * float(np.exp(np.median(finest.log_scales.max(axis=1))))
@@ -350,7 +357,8 @@ def splat_widths(path: Path, finest: Splats) -> list[float]:
     return every
 
 
-def _place(folder: Path, name: Any) -> Path:
+def beside(folder: Path, name: Any) -> Path:
+    """The file of this name in the folder or below it. Raises BadFileError."""
     parts = PurePosixPath(name).parts if isinstance(name, str) else ("..",)
     place = folder.joinpath(*parts)
     if ".." in parts or PurePosixPath(name).is_absolute() or not place.is_file():

@@ -51,6 +51,7 @@ CHECKS = {
     "v4.spz": _SPZ,
     "sog": Checks(independent_packed.sog),
     "lod-meta.json": Checks(independent_packed.streamed_sog),
+    "tileset.json": Checks(independent_readers.tileset),
     "html": Checks(independent_readers.html),
 }
 

@@ -9,6 +9,7 @@ splats, so that a wrong rotation of positions, quaternions or SH shows in the pi
 from __future__ import annotations
 
 import base64
+import json
 import math
 import tempfile
 import zlib
@@ -217,6 +218,21 @@ def gltf(path: Path) -> Splats:
     packed_antialias = any(part.draw_settings.antialias for part in parts)
     antialias = (document.asset.extras or {}).get("antialiased", packed_antialias)
     return concatenate(parts).with_antialias(antialias)
+
+
+def tileset(path: Path) -> Splats:
+    """The tiles that nothing replaces, from left to right."""
+    found: list[Splats] = []
+
+    def visit(tile: dict[str, Any], refine: str = "REPLACE") -> None:
+        refine = tile.get("refine", refine)
+        if "content" in tile and (refine == "ADD" or not tile.get("children")):
+            found.append(gltf(path.parent / tile["content"]["uri"]))
+        for child in tile.get("children", ()):
+            visit(child, refine)
+
+    visit(json.loads(path.read_text("utf-8"))["root"])
+    return concatenate(found).with_antialias(any(s.draw_settings.antialias for s in found))
 
 
 def _accessor_values(accessor: Any, view: Any, buffer: _Buffer) -> NDArray[np.floating]:

@@ -54,6 +54,11 @@ def losses_of(path: Path, splats: Splats, proof: Proof) -> dict[str, str]:
             f"{name} has no field for where the scene lies, which was written to "
             f"{offset_path(path).name}."
         )
+    if row.on_globe and splats.place is None:
+        losses["place"] = (
+            f"{name} has no place on the earth: globes show it at their centre, unless their "
+            "program places it (`modelMatrix` of CesiumJS)."
+        )
     return losses
 
 

@@ -40,16 +40,19 @@ def files(ending: str) -> dict[str, bytes]:
 
 
 @functools.cache
-def _streamed() -> dict[str, bytes]:
-    """lod-meta.json and its chunks."""
+def _streamed(name: str) -> dict[str, bytes]:
+    """An asset of this name and its chunks."""
     with tempfile.TemporaryDirectory() as folder:
-        formats.write(Path(folder) / "lod-meta.json", many_splats(SPLATS))
+        formats.write(Path(folder) / name, many_splats(SPLATS))
         every = sorted(path for path in Path(folder).rglob("*") if path.is_file())
         return {path.relative_to(folder).as_posix(): path.read_bytes() for path in every}
 
 
-def _streamed_beside() -> dict[str, bytes]:
-    return {name: content for name, content in _streamed().items() if name != "lod-meta.json"}
+def _streamed_layer(name: str) -> Layer:
+    def beside() -> dict[str, bytes]:
+        return {other: content for other, content in _streamed(name).items() if other != name}
+
+    return Layer(name, lambda: _streamed(name)[name], beside=beside, text=True)
 
 
 def _whole(ending: str) -> Callable[[], bytes]:
@@ -188,9 +191,8 @@ _USD = ("usda", "usdc", "usdz")
 
 LAYERS: dict[str, Layer] = {
     **{ending: _on_disk(ending) for ending in formats.FORMATS},
-    "lod-meta.json": Layer(
-        "lod-meta.json", lambda: _streamed()["lod-meta.json"], beside=_streamed_beside, text=True
-    ),
+    "lod-meta.json": _streamed_layer("lod-meta.json"),
+    "tileset.json": _streamed_layer("tileset.json"),
     "html": Layer("a.html", lambda: _html_parts()[1], _html_around, text=True),
     "ply, header and words": Layer("a.ply", _whole("ply"), text=True),
     "ply, ascii": Layer("a.ply", _ascii_ply, text=True),
