@@ -76,6 +76,7 @@ FORMAT_CELLS = (
         "any browser, from disk, without a network",
         "everything; also the viewer and the cameras",
     ),
+    (("ksplat",), "GaussianSplats3D", "read, not written"),
     (("mesh.glb",), "game engines, mesh tools", "no splats: triangles for collision"),
     (("mesh.ply",), "game engines, mesh tools", "no splats: triangles for collision"),
 )

@@ -17,6 +17,7 @@ from stages.formats import (
     gltf_read,
     gltf_spz,
     html,
+    ksplat,
     ply,
     sog,
     sog_read,
@@ -129,4 +130,5 @@ CODECS = {
         move=tileset.move,
     ),
     "html": Codec(html.write, html.read),
+    "ksplat": Codec(ksplat.write, ksplat.read),
 }

@@ -38,6 +38,7 @@ class Format:
         streamed: whether the asset has levels of detail. Its file name is `ending` alone, its
             chunks lie in folders beside it, and a folder holds one such asset.
         on_globe: whether programs put it where it lies on the earth.
+        written: whether it is written, too; others are read.
     """
 
     ending: str
@@ -53,6 +54,7 @@ class Format:
     says_drawing: bool = True
     streamed: bool = False
     on_globe: bool = False
+    written: bool = True
 
     def matches(self, name: str) -> bool:
         """Whether a file of this lower-case name is of this format."""
@@ -151,9 +153,11 @@ TABLE = (
         on_globe=True,
     ),
     Format("html", takes_views=True, drawn_antialiased=True),
+    Format("ksplat", loses="has 8-bit colours", written=False, says_drawing=False),
 )
 BY_ENDING = {row.ending: row for row in TABLE}
-FORMATS = {row.ending: row for row in TABLE if not row.streamed}  # one file each
+# what is written as one file each
+FORMATS = {row.ending: row for row in TABLE if row.written and not row.streamed}
 
 
 def format_of(path: Path) -> Format:

@@ -53,6 +53,7 @@ CHECKS = {
     "lod-meta.json": Checks(independent_packed.streamed_sog),
     "tileset.json": Checks(independent_readers.tileset),
     "html": Checks(independent_readers.html),
+    "ksplat": Checks(independent_packed.ksplat),
 }
 
 

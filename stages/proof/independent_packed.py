@@ -20,7 +20,13 @@ from PIL import Image
 from plyfile import PlyData
 
 from stages.formats.values import concatenate
-from stages.proof.content import NotCrossCheckedError, logits, says_antialiased, splats_by_rows
+from stages.proof.content import (
+    NotCrossCheckedError,
+    logits,
+    says_antialiased,
+    splats_by_rows,
+    splats_of,
+)
 from stages.scene import Splats
 
 
@@ -103,6 +109,51 @@ def spz_content(packed: bytes) -> Splats:
         }
 
     return splats_by_rows(n, values_of).with_antialias(flags & 1 == 1)
+
+
+def ksplat(path: Path) -> Splats:
+    content = path.read_bytes()
+    sections, level = content[4], content[20]
+    low, high = struct.unpack_from("<ff", content, 36)
+    low, high = low or -1.5, high or 1.5
+    at, parts = 4096 + 1024 * sections, []
+    for number in range(sections):
+        numbers = np.frombuffer(content, "<u4", 11, 4096 + 1024 * number).tolist()
+        n, room, size, buckets, _, _, steps, _, full, others, degree = numbers
+        (block,) = struct.unpack_from("<f", content, 4096 + 1024 * number + 16)
+        lengths = [size] * full + np.frombuffer(content, "<u4", others, at).tolist()
+        centres = np.frombuffer(content, "<f4", 3 * buckets, at + 4 * others).reshape(-1, 3)
+        k = (degree + 1) ** 2 - 1
+        widths = ((12, 12, 16, 4, 12 * k), (6, 6, 8, 4, 6 * k), (6, 6, 8, 4, 3 * k))[level]
+        at += 4 * others + 12 * buckets
+        rows = np.frombuffer(content, np.uint8, sum(widths) * room, at).reshape(room, -1)[:n]
+        at += sum(widths) * room
+        columns = np.split(rows, np.cumsum(widths)[:-1], axis=1)
+        kinds = (["<f4"] * 3, ["<u2", "<f2", "<f2"], ["<u2", "<f2", "<f2"])[level]
+        places, sizes, turns = (
+            np.ascontiguousarray(column).view(kind).astype(np.float64)
+            for column, kind in zip(columns[:3], kinds, strict=True)
+        )
+        if level:
+            places = (places / steps - 1) * block / 2 + np.repeat(centres, lengths, axis=0)
+        colours = columns[3] / 255
+        rest = np.ascontiguousarray(columns[4]).view(("<f4", "<f2", "u1")[level]).astype(float)
+        rest = low + (high - low) * rest / 255 if level == 2 else rest
+        sh = np.zeros((n, k + 1, 3))
+        sh[:, 0] = (colours[:, :3] - 0.5) * math.sqrt(4 * math.pi)
+        for c in range(3 * k):
+            channel, i = (c // 3, 1 + c % 3) if c < 9 else ((c - 9) // 5, 4 + (c - 9) % 5)
+            sh[:, i, channel] = rest[:, c]
+        parts.append(
+            splats_of(
+                means=places,
+                quaternions=turns,
+                log_scales=np.log(sizes),
+                opacity_logits=logits(colours[:, 3]),
+                sh=sh,
+            )
+        )
+    return concatenate(parts)
 
 
 def _joined(whole: bytes) -> bytes:

@@ -28,6 +28,7 @@ from tests.formats.truth import many_splats
 from tests.fuzz import camera_layers, photo_layers, run_layers
 from tests.fuzz.layer import SPLATS, Layer, checked
 
+_KSPLAT = Path(__file__).parents[1] / "formats" / "ksplat"
 _SPZ_4 = Path(__file__).parents[1] / "formats" / "spz4" / "adobe_degree_3.spz"
 
 
@@ -201,6 +202,10 @@ LAYERS: dict[str, Layer] = {
         lambda: gzip.decompress(files("spz")["a.spz"]),
         lambda inside: gzip.compress(inside, 1),
     ),
+    **{
+        f"ksplat, level {level}": Layer("a.ksplat", (_KSPLAT / f"level_{level}.ksplat").read_bytes)
+        for level in range(3)
+    },
     "spz 4": Layer("a.spz", _SPZ_4.read_bytes),
     "spz 4, unpacked": Layer("a.spz", lambda: b"".join([_spz_4()[0], *_spz_4()[1]]), _spz_4_with),
     "sog, meta.json": _part("sog", "meta.json", text=True),
