@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich.text import Text
@@ -69,9 +69,13 @@ def show(pipeline: Pipeline, until: str | None) -> None:
             progress.warn(manifest)
     if verdict:
         console.out.print()
-        text = Text(verdict["text"], style=_STYLES[verdict["grade"]])
-        console.paragraph(console.out, text)
+        console.paragraph(console.out, styled(verdict))
         console.out.print(f"Look at it: splat view {pipeline.run_folder}", markup=False)
+
+
+def styled(verdict: Mapping[str, str]) -> Text:
+    """The sentence of a verdict in the colour of its grade."""
+    return Text(verdict["text"], style=_STYLES[verdict["grade"]])
 
 
 def _verdict(manifests: Sequence[Manifest]) -> dict[str, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -135,3 +136,35 @@ def test_asking_for_a_format_that_is_there_runs_nothing_and_loses_none(copied: P
     assert [event["stage"] for event in ran if event["event"] == "started"] == []
     manifest = json.loads((copied / "run" / "7-export" / "manifest.json").read_text())
     assert sorted(manifest["settings"]["formats"]) == sorted(FORMATS)
+
+
+def test_a_file_is_measured_on_photographs_as_the_run_measured_it(
+    result: dict[str, Any], copied: Path
+) -> None:
+    """The photographs that structure from motion undistorted, and its model of them."""
+    model = copied / "model"  # of another program, as far as this command can know
+    shutil.copytree(copied / "run" / "2-sfm" / "colmap", model)
+    words = ("--photos", str(model / "images"), "--cameras", str(model / "sparse" / "0"), "--json")
+    (found,) = (
+        event
+        for event in events(splat("verify", "run/7-export/scene.ply", *words, folder=copied))
+        if event["event"] == "verified"
+    )
+    assert found["given_world"] == "the cameras' world"
+    assert found["given_drawing"] == "plain"
+    assert found["splats"] == metrics(result, "prune")["splats"]
+    low, high = sample.PSNR_DB
+    assert low - 1 < found["psnr_quarter_db"] < high + 1  # trained at a quarter of 640 pixels
+    assert found["warnings"][0].startswith("The given splats may have been trained on 3")
+
+
+def test_a_second_run_goes_on_from_the_first(result: dict[str, Any], copied: Path) -> None:
+    words = ("process", "run", "--out", "more", "--splats", "run")
+    still = events(splat(*words, "--json", folder=copied))[-1]
+    assert metrics(still, "train")["psnr_db"] == pytest.approx(
+        metrics(result, "train")["psnr_db"], abs=0.002
+    )
+    further = events(splat(*words, "--steps", "100", "--json", folder=copied))[-1]
+    assert metrics(further, "train")["steps"] == 100
+    assert metrics(further, "train")["psnr_db"] > metrics(result, "train")["psnr_db"] - 0.2
+    assert further["verdict"]["grade"] == result["verdict"]["grade"]

@@ -11,14 +11,12 @@ from splatcli.arguments import Cluster, Out, Photos, Run
 from splatcli.folders import DEFAULT, find_run_folder, run_folder_for
 from stages.base.errors import UsageError
 from stages.base.settings import UNSET, changed
-from stages.cameras.camera_formats import read_cameras
 from stages.run import runfolder
 from stages.run.branch import branch
 from stages.run.listener import Listener, Listeners
 from stages.run.pipeline import Pipeline
 from stages.run.stages import STAGE_NAMES
-from stages.seed.settings import SPLATS_OF_A_STAGE, check_given
-from stages.sfm.known.match_cameras import check_split
+from stages.seed.settings import SPLATS_OF_A_STAGE
 from stages.viewer.live_training import LiveTraining
 from stages.viewer.server import open_in_browser
 
@@ -47,11 +45,8 @@ def process(
         given["splats"] = _trained_splats(splats, run_folder)
     is_known = runfolder.is_run_folder(run_folder)
     settings = run_settings.combined(run_settings.recorded(pipeline), given, preset)
-    sfm = settings["sfm"]
-    if "cameras" in given and sfm.cameras:  # errors of the file now, before photographs are read
-        check_split(read_cameras(sfm.cameras), sfm.split)
-    if "splats" in given and settings["seed"].splats:
-        check_given(settings["seed"].splats, has_cameras=sfm.cameras is not None)
+    if given.keys() & {"cameras", "splats"}:
+        run_settings.check_files(settings)
     if is_known and console.mode.has_notes:
         console.note(run_settings.training_summary(settings["train"], given, preset))
     _run(pipeline, settings, view=view)

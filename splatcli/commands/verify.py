@@ -12,6 +12,7 @@ import typer
 
 from splatcli import console
 from splatcli.folders import find_run_folder
+from splatcli.photo_check import check_on_photos
 from stages import formats
 from stages.base.errors import QualityError, UsageError
 from stages.formats import format_of
@@ -54,11 +55,33 @@ def verify(
             help="Run folder or splat file that it must equal; by default the run around it.",
         ),
     ] = None,
+    photos: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PATH",
+            help="Photographs or video: measure the splats of any program on them instead.",
+        ),
+    ] = None,
+    cameras: Annotated[
+        Path | None,
+        typer.Option(metavar="PATH", help="Cameras of --photos that the splats were trained with."),
+    ] = None,
+    split: Annotated[
+        bool, typer.Option("--split", help="Use the test photographs of --cameras.")
+    ] = False,
 ) -> None:
     """Verify a file: read it with a second parser, draw it, compare it with what was trained.
 
-    Exit status 7 if a file is wrong.
+    With --photos: draw it from their cameras and compare it with them. Exit status 7 if a file is
+    wrong.
     """
+    if photos is not None:
+        if target is None or against is not None:
+            raise _two_originals()
+        check_on_photos(target, photos, {"cameras": cameras, "split": split})
+        return
+    if cameras is not None:
+        raise _two_originals()
     files = _files(target)
     for file in files:
         formats.format_of(file)  # raises before any work is done
@@ -88,6 +111,15 @@ def verify(
     if not console.mode.as_json:
         _print(proofs, original, losses)
     _raise_if_wrong(proofs, original)
+
+
+def _two_originals() -> UsageError:
+    return UsageError(
+        "option-alone",
+        given="--photos, --cameras and --against do not go together so.",
+        wanted="A file with --photos and --cameras, or a file or a run with or without --against.",
+        hint="splat verify FILE --photos PHOTOS --cameras MODEL",
+    )
 
 
 def _files(target: Path | None) -> list[Path]:

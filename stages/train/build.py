@@ -41,7 +41,8 @@ def make_trainer(
     sh_degree = max(settings.sh_degree if settings.steps else 0, start.sh_degree)
     draw_settings = draw_settings_of(reconstruction.views, settings.train_side, light, antialias)
     held_out = load_evaluation_views(reconstruction.folder, held, draw_settings)
-    _warn_of_small_photographs(reconstruction, settings.train_side, report)
+    if settings.steps:
+        _warn_of_small_photographs(reconstruction, settings.train_side, report)
     determined = splats_determined([view.levels[-1].camera for view in train], sh_degree)
     since = _part(settings)
     cap = cap_for(folder, len(start) if since == LAST_PART else settings.max_splats, determined)

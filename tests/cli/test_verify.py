@@ -237,3 +237,25 @@ def test_a_format_that_cannot_be_verified_is_reported_before_any_work(tmp_path: 
     folder = tmp_path / "folder"
     folder.mkdir()
     assert "run-folder-missing" in verified(tmp_path / "a.splat", "--against", folder, code=5)[1]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--photos", "photos"],
+        ["scene.ply", "--photos", "photos", "--against", "other.ply"],
+        ["scene.ply", "--cameras", "sparse"],
+    ],
+)
+def test_photographs_are_an_original_of_their_own(words: list[str]) -> None:
+    _, err = verified(*words, code=2)
+    assert "splat verify FILE --photos PHOTOS --cameras MODEL" in err
+
+
+def test_splats_are_not_measured_on_photographs_without_their_cameras(
+    scene: SmallScene, tmp_path: Path
+) -> None:
+    path = tmp_path / "scene.ply"
+    formats.write(path, scene.splats)
+    _, err = verified(path, "--photos", scene.reconstruction.folder, code=2)
+    assert "seed-splats-without-cameras" in err
