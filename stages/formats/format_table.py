@@ -109,6 +109,7 @@ TABLE = (
         "spz.glb",
         loses="has sizes in steps of 6 %, 8-bit colours and view-dependent colour of 4 and 5 bits",
         needs_finetuning=True,
+        drawn_antialiased=True,
         y_up=True,
     ),
     Format(
@@ -148,6 +149,7 @@ TABLE = (
     Format(
         "tileset.json",
         loses="has sizes in steps of 6 %, 8-bit colours and view-dependent colour of 4 and 5 bits",
+        drawn_antialiased=True,
         y_up=True,
         streamed=True,
         on_globe=True,

@@ -34,8 +34,9 @@ from stages.scene import Splats
 from stages.scene.flip import flipped
 
 # Viewers refine a tile whose geometric error is wider than 16 pixels, if nobody sets another
-# number: then splats of a level are never wider than a pixel.
-_USUAL_PIXELS = 16
+# number. Here that is where its splats are wider than 4: CesiumJS does not widen splats, leaves out
+# those below 0.7 pixels, and so draws a coarser level better.
+_USUAL_PIXELS, _WIDEST_PIXELS = 16, 4
 # From our axes to those of a tileset: x, then what glTF has along -z, then up.
 _FROM_OURS = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 _META_LIMIT_BYTES = 1 << 26
@@ -165,7 +166,8 @@ def _described(levels: Sequence[Splats], root: _Tile, units: str) -> dict[str, A
     finest = levels[0]
     said = flipped(finest.take(slice(0)))
     extensions = [EXTENSION, SPZ_EXTENSION]
-    errors = [_USUAL_PIXELS * width for width in level_widths([len(s) for s in levels], finest)]
+    widths = level_widths([len(level) for level in levels], finest)
+    errors = [_USUAL_PIXELS / _WIDEST_PIXELS * width for width in widths]
     # so that a viewer leaves the scene out where it is smaller than a pixel
     sides = np.ptp(finest.means, axis=0) if len(finest) else np.zeros(3)
     whole = max(_USUAL_PIXELS * float(np.linalg.norm(sides)), *errors)
