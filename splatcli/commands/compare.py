@@ -52,7 +52,7 @@ def compare(
             verdict=change.verdict,
             psnr_change_db=change.mean,
             psnr_change_by_size_db={n: d.mean for n, d in comparison.psnr_by_size.items()},
-            interval_db=[change.low, change.high] if change.views > 1 else None,
+            interval_db=[change.low, change.high] if change.shown else None,
             views=change.views,
             files=[str(file) for file in files],
         )

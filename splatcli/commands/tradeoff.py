@@ -18,7 +18,8 @@ from stages.evaluate.evaluation import load_evaluation_views
 from stages.prune.stage import pruner_of
 from stages.run import results
 from stages.run.pipeline import Pipeline
-from stages.scene import Splats, split_held_out
+from stages.scene import Splats, evenly_spaced, split_held_out
+from stages.tradeoff.intervals import TRAINING_VIEWS
 from stages.tradeoff.measurement import TradeoffInputs, measure_tradeoff
 from stages.tradeoff.report import summarise, write_report
 
@@ -90,6 +91,7 @@ def _inputs(pipeline: Pipeline) -> TradeoffInputs:
     return TradeoffInputs(
         splats=splats,
         held_out=load_evaluation_views(reconstruction.folder, held, settings),
+        training=evenly_spaced(views, TRAINING_VIEWS),
         views=reconstruction.views,
         units=reconstruction.units,
         backend=backend,

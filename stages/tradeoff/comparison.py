@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from stages.base.atomic import write_csv
 from stages.base.errors import UsageError
 from stages.base.text import counted
@@ -19,10 +17,14 @@ from stages.evaluate.evaluation import (
     image_renderer,
     load_evaluation_views,
 )
-from stages.scene import Reconstruction, Splats, View, split_held_out
+from stages.scene import Reconstruction, Splats, View, evenly_spaced, split_held_out
 from stages.tradeoff import html
-from stages.tradeoff.bootstrap import Difference, paired_difference
-from stages.tradeoff.curves import mean_db, psnr_change
+from stages.tradeoff.curves import change_of, mean_db
+from stages.tradeoff.intervals import (
+    OTHER_VIEWS,
+    TRAINING_VIEWS,
+    Difference,
+)
 
 
 @dataclass(frozen=True)
@@ -36,19 +38,21 @@ class Candidate:
     facts: dict[str, str]
 
     @property
-    def held_out(self) -> dict[str, View]:
-        """The held-out views of this run by name."""
-        return {view.name: view for view in split_held_out(self.reconstruction.views)[1]}
+    def split(self) -> tuple[dict[str, View], dict[str, View]]:
+        """The training and the held-out views of this run by name."""
+        training, held_out = split_held_out(self.reconstruction.views)
+        return {view.name: view for view in training}, {view.name: view for view in held_out}
 
     def side_px(self, name: str) -> int:
         """Longer side of the held-out view `name`, as this run draws it."""
-        camera = self.splats.draw_settings.camera(self.held_out[name].camera)
+        camera = self.splats.draw_settings.camera(self.split[1][name].camera)
         return max(camera.width, camera.height)
 
     def views(self, names: Sequence[str], side_px: int) -> tuple[EvaluationView, ...]:
-        """The held-out views `names` with this run's cameras. Raises SplatError."""
-        held_out, settings = self.held_out, replace(self.splats.draw_settings, side=side_px)
-        chosen = [held_out[name] for name in names]
+        """The views `names` with this run's cameras. Raises SplatError."""
+        settings = replace(self.splats.draw_settings, side=side_px)
+        by_name = {view.name: view for view in self.reconstruction.views}
+        chosen = [by_name[name] for name in names]
         return tuple(load_evaluation_views(self.reconstruction.folder, chosen, settings))
 
 
@@ -86,7 +90,7 @@ class Comparison:
 def compare_runs(first: Candidate, second: Candidate) -> Comparison:
     """Evaluate both on the views that both hold out, at the smaller size of the two, each with its
     own run's camera. Raises SplatError (compare-nothing-in-common)."""
-    names = sorted(first.held_out.keys() & second.held_out.keys())
+    training, names = (sorted(a.keys() & b) for a, b in zip(first.split, second.split, strict=True))
     if not names:
         raise UsageError(
             "compare-nothing-in-common",
@@ -96,14 +100,17 @@ def compare_runs(first: Candidate, second: Candidate) -> Comparison:
         )
     both = (first, second)
     side_px = min(one.side_px(name) for one in both for name in names)
+    names, count = [*names, *evenly_spaced(training, TRAINING_VIEWS)], len(names)
     views = (first.views(names, side_px), second.views(names, side_px))
     a, b = (
         evaluate_at_sizes(image_renderer(one.splats, one.backend), seen)
         for one, seen in zip(both, views, strict=True)
     )
-    ssim = np.array([two.ssim - one.ssim for one, two in zip(a["full"], b["full"], strict=True)])
-    psnr = {size: psnr_change(b[size], a[size]) for size in SIZES}
-    return Comparison(both, views, (a, b), paired_difference(ssim), psnr, side_px)
+    ssim = change_of(b["full"], a["full"], count, "ssim")
+    psnr = {size: change_of(b[size], a[size], count) for size in SIZES}
+    a, b = ({size: scores[:count] for size, scores in found.items()} for found in (a, b))
+    views = (views[0][:count], views[1][:count])
+    return Comparison(both, views, (a, b), ssim, psnr, side_px)
 
 
 def verdict_lines(comparison: Comparison) -> list[str]:
@@ -123,8 +130,8 @@ def verdict_lines(comparison: Comparison) -> list[str]:
 
 
 def _in_words(change: Difference, digits: int, unit: str = "") -> str:
-    interval = f"95 %: {change.low:+.{digits}f} to {change.high:+.{digits}f}"
-    interval = interval if change.views > 1 else "one view"
+    interval = f"{OTHER_VIEWS}: {change.low:+.{digits}f} to {change.high:+.{digits}f}"
+    interval = interval if change.shown else "no interval"
     return f"{change.mean:+.{digits}f}{unit} ({interval}): {change.verdict}."
 
 

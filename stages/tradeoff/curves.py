@@ -11,7 +11,7 @@ import numpy as np
 from stages.evaluate.coverage import Patches
 from stages.evaluate.evaluation import Score
 from stages.scene import Camera
-from stages.tradeoff.bootstrap import Difference, paired_difference
+from stages.tradeoff.intervals import Difference, paired_difference
 
 
 @dataclass(frozen=True)
@@ -97,10 +97,14 @@ def mean_db(scores: Sequence[Score]) -> float:
     return float(np.mean([score.psnr_db for score in scores]))
 
 
-def psnr_change(scores: Sequence[Score], baseline: Sequence[Score]) -> Difference:
-    """Of the same views in the same order, in dB."""
+def change_of(
+    scores: Sequence[Score], baseline: Sequence[Score], held_out: int, figure: str = "psnr_db"
+) -> Difference:
+    """Of one `figure` of the same views in the same order: so many held-out ones, then training
+    views."""
     pairs = zip(scores, baseline, strict=True)
-    return paired_difference(np.array([a.psnr_db - b.psnr_db for a, b in pairs]))
+    changes = {a.name: getattr(a, figure) - getattr(b, figure) for a, b in pairs}
+    return paired_difference(changes, held_out)
 
 
 def time_to(history: Sequence[HistoryPoint], below_db: float) -> tuple[float, float]:

@@ -19,8 +19,8 @@ from stages.tradeoff.curves import (
     HistoryPoint,
     OperatingPoint,
     Tradeoff,
+    change_of,
     mean_db,
-    psnr_change,
 )
 
 # Of the run's splats: those that pruning to a given number is measured at.
@@ -39,6 +39,7 @@ class TradeoffInputs:
     Args:
         splats: the run's last, in the coordinates of its cameras.
         held_out: views that quality is measured with.
+        training: views that say how changes vary in the scene, see `intervals`.
         views: all views of the run.
         units: of lengths.
         backend: the rasteriser's name.
@@ -51,6 +52,7 @@ class TradeoffInputs:
 
     splats: Splats
     held_out: Sequence[EvaluationView]
+    training: Sequence[EvaluationView]
     views: tuple[View, ...]
     units: str
     backend: str
@@ -67,7 +69,7 @@ def measure_tradeoff(inputs: TradeoffInputs, progress: ProgressCallback) -> Trad
     inputs = replace(inputs, splats=splats)
     progress("evaluating the run's splats")
     own_scores = _scores(inputs, splats)
-    own = _point("as it is", splats, own_scores, own_scores)
+    own = _point(inputs, "as it is", splats, own_scores, own_scores)
     progress("measuring the coverage of the capture")
     coverage = measure_coverage(splats, split_held_out(inputs.views)[0], inputs.backend)
     return Tradeoff(
@@ -75,7 +77,7 @@ def measure_tradeoff(inputs: TradeoffInputs, progress: ProgressCallback) -> Trad
         history=_history(inputs.history),
         formats=_formats(inputs, own_scores, progress),
         pruned=(own, *_pruned(inputs, own_scores, progress)),
-        scores=tuple(own_scores),
+        scores=tuple(own_scores[: len(inputs.held_out)]),
         side_px=max(max(view.pixels.shape[:2]) for view in inputs.held_out),
         coverage=coverage,
         exported=inputs.exported,
@@ -83,13 +85,22 @@ def measure_tradeoff(inputs: TradeoffInputs, progress: ProgressCallback) -> Trad
 
 
 def _scores(inputs: TradeoffInputs, splats: Splats) -> list[Score]:
-    return evaluate(image_renderer(splats, inputs.backend), inputs.held_out)
+    """Of the held-out views, then of the training views."""
+    draw = image_renderer(splats, inputs.backend)
+    return evaluate(draw, inputs.held_out) + evaluate(draw, inputs.training)
 
 
 def _point(
-    label: str, splats: Splats, scores: list[Score], own: list[Score], size: int | None = None
+    inputs: TradeoffInputs,
+    label: str,
+    splats: Splats,
+    scores: list[Score],
+    own: list[Score],
+    size: int | None = None,
 ) -> OperatingPoint:
-    return OperatingPoint(label, len(splats), mean_db(scores), psnr_change(scores, own), size)
+    count = len(inputs.held_out)
+    change = change_of(scores, own, count)
+    return OperatingPoint(label, len(splats), mean_db(scores[:count]), change, size)
 
 
 def _history(history: Sequence[dict[str, Any]]) -> tuple[HistoryPoint, ...]:
@@ -118,7 +129,7 @@ def _formats(
             for file in row.files(path):
                 file.unlink()
             scores = own if _identical(read, splats) else _scores(inputs, read)
-            points.append(_point(f".{name}", read, scores, own, size))
+            points.append(_point(inputs, f".{name}", read, scores, own, size))
     return tuple(sorted(points, key=lambda point: point.size_bytes or 0))
 
 
@@ -145,7 +156,7 @@ def _pruned(
             continue
         progress(f"keeping {share:.0%} of the splats")
         splats = inputs.prune_to(splats, count)
-        points.append(_point(f"{share:.0%}", splats, _scores(inputs, splats), own))
+        points.append(_point(inputs, f"{share:.0%}", splats, _scores(inputs, splats), own))
     return points
 
 

@@ -12,6 +12,7 @@ from stages.evaluate.evaluation import image_renderer
 from stages.evaluate.image_metrics import psnr_text
 from stages.tradeoff import html, report_text
 from stages.tradeoff.curves import OperatingPoint, Tradeoff
+from stages.tradeoff.intervals import OTHER_VIEWS
 from stages.tradeoff.measurement import TradeoffInputs
 from stages.tradeoff.plots import write_plots
 
@@ -42,9 +43,9 @@ def write_report(folder: Path, name: str, tradeoff: Tradeoff, inputs: TradeoffIn
     write_csv(table, (_COLUMNS, *_rows(tradeoff)))
     introduction = (
         f"Quality is the PSNR of {len(tradeoff.scores)} held-out views, which training never saw, "
-        f"drawn {tradeoff.side_px} pixels large. Intervals (95 %) are of the difference to this "
-        "run's splats, view by view: they are about other views of this scene, not about another "
-        "run with another seed."
+        f'drawn {tradeoff.side_px} pixels large. What stands after "{OTHER_VIEWS}" holds the mean '
+        "change over other views of this scene in nine of ten cases. It is not about another run "
+        "with another seed."
     )
     parts = [html.paragraphs([introduction])]
     for stem, (title, about) in _SECTIONS.items():

@@ -14,8 +14,8 @@ from stages.evaluate.coverage import (
     PoorRegion,
     poorly_covered_regions,
 )
-from stages.tradeoff.bootstrap import FEWEST_SHOWN, Difference
 from stages.tradeoff.curves import Coverage, OperatingPoint, Tradeoff, time_to
+from stages.tradeoff.intervals import OTHER_VIEWS, Difference
 
 SMALL_LOSS_DB = 0.1  # that few people would see
 NO_TIMES = "Training logged no times (an older version trained this run). Run `splat train` again."
@@ -102,11 +102,8 @@ def about_photographs(tradeoff: Tradeoff) -> list[str]:
         f"The worst of {count} is no. {tradeoff.scores.index(worst) + 1}, {worst.name}: "
         f"{worst.psnr_db:.2f} dB, {tradeoff.own.psnr_db - worst.psnr_db:.2f} below the mean."
     ]
-    if count < FEWEST_SHOWN:
-        are = "is" if count == 1 else "are"
-        lines.append(f"{counted(count, 'held-out view')} {are} too few for intervals.")
-    elif count < 8:
-        lines.append(f"There are only {counted(count, 'held-out view')}: intervals are wide.")
+    if count < 8:
+        lines.append(f"With {counted(count, 'held-out view')}, intervals are wide.")
     return lines
 
 
@@ -141,10 +138,10 @@ def _region(coverage: Coverage, region: PoorRegion) -> str:
 
 
 def costs(change: Difference) -> str:
-    """ "costs 0.21 dB (95 %: 0.10 to 0.32)"."""
+    """ "costs 0.21 dB (other views, 90 %: 0.10 to 0.32)"."""
     sign = -1 if change.mean <= 0 else 1
     ends = sorted((sign * change.low, sign * change.high))
-    interval = f"95 %: {ends[0]:.2f} to {ends[1]:.2f}"
+    interval = f"{OTHER_VIEWS}: {ends[0]:.2f} to {ends[1]:.2f}"
     if not change.shown:
         interval = f"of {counted(change.views, 'photograph')}"
     return f"{'costs' if sign < 0 else 'gains'} {abs(change.mean):.2f} dB ({interval})"

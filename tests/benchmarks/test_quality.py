@@ -15,9 +15,10 @@ from stages.evaluate.evaluation import SIZES, EvaluationView
 from stages.evaluate.image_metrics import IDENTICAL_DB
 from stages.raster.draw import raster_settings_of, render
 from stages.sfm.settings import SfmSettings
+from stages.tradeoff.intervals import BETTER, INCONCLUSIVE
 from tests.benchmarks import captures, quality, sizes
 from tests.benchmarks.captures import SOURCES, Source
-from tests.benchmarks.verdicts import Cell, read, verdicts, write
+from tests.benchmarks.verdicts import Cell, difference_over, read, verdicts, write
 from tests.scenes import camera, cloud
 
 SENSOR = ["2759.5 0 1520.7", "0 2764.2 1006.8", "0 0 1", "0 0 0"]
@@ -110,6 +111,14 @@ def test_a_verdict_is_by_captures_and_not_only_within_each(
     assert len(lines) == 5 * 3 + 3
     assert lines[0].startswith(f"c0 preview, full size: {'better' if gains_db[0] > 0 else 'worse'}")
     assert lines[-3].startswith(f"5 captures, preview, full size: {verdict}")
+
+
+def test_seeds_that_disagree_widen_the_interval_though_photographs_agree() -> None:
+    agreeing = difference_over(np.full((12, 3), 0.3))
+    disagreeing = difference_over(np.tile([0.0, 0.3, 0.6], (12, 1)))
+    assert agreeing.verdict == BETTER
+    assert disagreeing.mean == pytest.approx(agreeing.mean)
+    assert disagreeing.verdict == INCONCLUSIVE
 
 
 def test_one_capture_gives_no_interval_over_captures() -> None:

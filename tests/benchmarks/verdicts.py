@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stages.evaluate.evaluation import SIZES
-from stages.tradeoff.bootstrap import Difference, paired_difference
+from stages.tradeoff.intervals import Difference, half_width
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,7 @@ def verdicts(now: Sequence[Cell], before: Sequence[Cell]) -> Iterator[str]:
             table = _gains_db(pairs, size)
             if not table:
                 continue
-            difference = paired_difference(np.array(list(table.values())).T)
+            difference = difference_over(np.array(list(table.values())).T)
             yield f"{capture} {preset}, {size} size: {in_words(difference)}"
             means = {seed: float(np.mean(column)) for seed, column in table.items()}
             gains.setdefault((preset, size), {})[capture] = means
@@ -86,7 +88,20 @@ def verdicts(now: Sequence[Cell], before: Sequence[Cell]) -> Iterator[str]:
             continue
         means_db = [[means[seed] for seed in common] for means in by_capture.values()]
         over = f"{len(by_capture)} captures, {preset}, {size} size"
-        yield f"{over}: {in_words(paired_difference(np.array(means_db)))}"
+        yield f"{over}: {in_words(difference_over(np.array(means_db)))}"
+
+
+def difference_over(table: NDArray[np.float64]) -> Difference:
+    """The mean of `table` [views, seeds], and its interval over other views and, where there are
+    several, other seeds: both have effects of their own, and those of the rarer say how sure the
+    variance is. It has no ends for a single view."""
+    views, mean = table.shape[0], float(table.mean())
+    if views == 1:
+        return Difference(mean, -math.inf, math.inf, views)
+    means = [x for x in (table.mean(axis=1), table.mean(axis=0)) if len(x) > 1]
+    variance = sum(float(x.var(ddof=1)) / len(x) for x in means)
+    half = half_width(variance, min(len(x) for x in means) - 1)
+    return Difference(mean, mean - half, mean + half, views)
 
 
 def _gains_db(pairs: Sequence[tuple[Cell, Cell]], size: str) -> dict[int, list[float]]:

@@ -5,7 +5,6 @@ import pytest
 
 from stages.evaluate.coverage import Patches
 from stages.tradeoff import report_text
-from stages.tradeoff.bootstrap import paired_difference
 from stages.tradeoff.curves import (
     Coverage,
     HistoryPoint,
@@ -14,6 +13,7 @@ from stages.tradeoff.curves import (
     knee,
     time_to,
 )
+from stages.tradeoff.intervals import paired_difference
 
 
 def history(*psnr):
@@ -49,21 +49,22 @@ def test_a_curve_that_gains_more_and_more_has_no_knee():
     assert knee([8, 4, 2, 1], [16, 12, 10.5, 10]) == 0
 
 
+def change_by(held_out, training):
+    named = {str(number): db for number, db in enumerate([*held_out, *training])}
+    return paired_difference(named, len(held_out))
+
+
 def test_a_loss_is_a_cost_and_its_interval_has_the_same_sign():
-    change = paired_difference(np.array([-0.2, -0.22, -0.18, -0.2, -0.21, -0.19]))
+    change = change_by([-0.2, -0.22, -0.18, -0.2, -0.21, -0.19], [-0.2, -0.22, -0.18])
     text = report_text.costs(change)
-    assert text.startswith("costs 0.20 dB (95 %: 0.1")
+    assert text.startswith("costs 0.20 dB (other views, 90 %: 0.1")
     low, high = (float(x) for x in text.split("%: ")[1].rstrip(")").split(" to "))
     assert low < 0.2 < high
 
 
 def test_a_single_view_has_no_interval():
-    assert (
-        report_text.costs(paired_difference(np.array([-0.2]))) == "costs 0.20 dB (of 1 photograph)"
-    )
-    assert (
-        report_text.costs(paired_difference(np.array([0.2]))) == "gains 0.20 dB (of 1 photograph)"
-    )
+    assert report_text.costs(change_by([-0.2], [])) == "costs 0.20 dB (of 1 photograph)"
+    assert report_text.costs(change_by([0.2], [])) == "gains 0.20 dB (of 1 photograph)"
 
 
 def empty_coverage() -> Coverage:
@@ -75,14 +76,12 @@ def empty_coverage() -> Coverage:
 
 @pytest.mark.parametrize("logged", [0, 1])
 def test_a_run_without_a_log_says_so(logged):
-    own = OperatingPoint("as it is", 100, 20.0, paired_difference(np.zeros(3)))
+    own = OperatingPoint("as it is", 100, 20.0, change_by([0.0] * 3, []))
     course = tuple(history(20.0)[:logged])
     tradeoff = Tradeoff(own, course, (), (own,), (), 480, empty_coverage())
     assert report_text.about_time(tradeoff) == [report_text.NO_TIMES]
 
 
-def test_an_interval_of_few_photographs_is_not_shown() -> None:
-    few = paired_difference(np.array([-0.2, -0.3, -0.1]))
-    assert report_text.costs(few) == "costs 0.20 dB (of 3 photographs)"
-    enough = paired_difference(np.array([-0.2, -0.3, -0.1, -0.2, -0.2]))
-    assert "95 %" in report_text.costs(enough)
+def test_a_single_view_has_an_interval_where_training_views_say_how_far_views_differ() -> None:
+    one = change_by([-0.2], [-0.3, -0.31, -0.29])
+    assert report_text.costs(one) == "costs 0.20 dB (other views, 90 %: 0.16 to 0.24)"

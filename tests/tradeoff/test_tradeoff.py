@@ -23,7 +23,6 @@ from stages.scene import (
     split_held_out,
 )
 from stages.tradeoff import report_text
-from stages.tradeoff.bootstrap import BETTER, INCONCLUSIVE, WORSE
 from stages.tradeoff.comparison import (
     Candidate,
     compare_runs,
@@ -31,6 +30,7 @@ from stages.tradeoff.comparison import (
     verdict_lines,
     write_comparison,
 )
+from stages.tradeoff.intervals import BETTER, INCONCLUSIVE, TRAINING_VIEWS, WORSE
 from stages.tradeoff.measurement import SHARES, TradeoffInputs, measure_tradeoff
 from stages.tradeoff.report import write_report
 from tests.small_scene import small_scene
@@ -66,6 +66,7 @@ def inputs(scene):
     return TradeoffInputs(
         splats,
         held,
+        evenly_spaced(training, TRAINING_VIEWS),
         reconstruction.views,
         "metres",
         "cpu",
@@ -198,16 +199,20 @@ def test_a_run_without_a_log_gets_the_other_curves(inputs, tmp_path) -> None:
 
 
 @pytest.mark.slow
-def test_a_single_held_out_view_has_no_interval(scene, inputs, tmp_path) -> None:
+def test_a_single_held_out_view_has_an_interval(scene, inputs, tmp_path) -> None:
     tradeoff = measure_tradeoff(replace(inputs, held_out=inputs.held_out[:1]), lambda label: None)
     write_report(tmp_path, "scene", tradeoff, inputs)
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert "1 held-out view is too few for intervals." in text
+    assert "With 1 held-out view, intervals are wide." in text
     assert "inf" not in re.sub(r"<[^>]*>", " ", text)
+    assert tradeoff.pruned[-1].change.verdict == WORSE
     few = replace(scene.reconstruction, views=scene.reconstruction.views[:5])
     both = [replace(side(scene, name), reconstruction=few) for name in "ab"]
     lines = verdict_lines(compare_runs(*both))
-    assert lines[0] == "b against a: +0.00 dB (one view): no significant difference."
+    assert (
+        lines[0]
+        == "b against a: +0.00 dB (other views, 90 %: +0.00 to +0.00): no significant difference."
+    )
     assert "1 held-out view," in lines[-1]
 
 
@@ -226,7 +231,7 @@ def test_a_run_does_not_differ_from_itself(scene) -> None:
     found = compare_runs(side(scene, "a"), side(scene, "b"))
     assert (found.psnr.mean, found.psnr.verdict) == (0, INCONCLUSIVE)
     assert (
-        "b against a: +0.00 dB (95 %: +0.00 to +0.00): no significant difference."
+        "b against a: +0.00 dB (other views, 90 %: +0.00 to +0.00): no significant difference."
         in verdict_lines(found)
     )
 
