@@ -1,5 +1,5 @@
 """Whether one of two results is better: the mean of paired differences of views (in their unit,
-mostly dB of PSNR), and an interval of their mean over other views of the scene."""
+mostly dB of PSNR), and an interval of their mean over a dozen other views of the scene."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 CONFIDENCE = 0.9
+OTHERS = 12  # views of the scene that an interval is about, or as many as are held out, if more
 OTHER_VIEWS = f"other views, {100 * CONFIDENCE:.0f} %"  # what an interval is of, in words
 TRAINING_VIEWS = 24  # at most, evenly spaced, that say how differences vary in a scene
 # Differences of held-out views vary so many times as far as those of training views, whose variance
@@ -26,8 +27,8 @@ class Difference:
 
     Args:
         mean: of the held-out views, candidate minus baseline.
-        low, high: ends of the interval, which holds the mean of other views of the scene in
-            `CONFIDENCE` of cases; infinite without two training views at least.
+        low, high: ends of the interval, which holds the mean of a dozen other views of the scene
+            in `CONFIDENCE` of cases; infinite without two training views at least.
         views: how many the mean is of.
     """
 
@@ -55,7 +56,8 @@ def paired_difference(differences: Mapping[str, float], held_out: int) -> Differ
     Few views do not say how far views differ. Training views do: their mean is not that of unseen
     views, but their variance is close to it. And neighbours in the order of names show much the
     same. So what training views tell of their neighbours is subtracted from every difference (a
-    control variate), and the interval is Student's, of the rest.
+    control variate), and the interval is Student's, of the rest. It is a prediction: other views
+    have an error of their own, so that whoever measures `OTHERS` more can tell whether it is right.
 
     Args:
         differences: by name of the view. The first `held_out` are of views that no result was
@@ -72,11 +74,16 @@ def paired_difference(differences: Mapping[str, float], held_out: int) -> Differ
     if trained < 2:
         return Difference(mean, -math.inf, math.inf, held_out)
     slope, rest = _less_neighbours(differences, held_out)
-    unseen, seen, worth = rest[:held_out], rest[held_out:], min(_WORTH, trained - 1)
-    squares = held_out * unseen.var() + worth * _WIDER**2 * seen.var(ddof=1)
+    worth = min(_WORTH, trained - 1)
     freedom = held_out - 1 + worth
-    half = half_width(squares / freedom * (1 / held_out + slope**2 / trained), freedom)
-    centre = float(unseen.mean() + slope * values[held_out:].mean())
+
+    def variance(x: NDArray[np.float64]) -> float:
+        squares = worth * _WIDER**2 * x[held_out:].var(ddof=1)
+        return float(squares + held_out * x[:held_out].var()) / freedom
+
+    of_mean = variance(rest) * (1 / held_out + slope**2 / trained)
+    half = half_width(of_mean + variance(values) / max(OTHERS, held_out), freedom)
+    centre = float(rest[:held_out].mean() + slope * values[held_out:].mean())
     return Difference(mean, centre - half, centre + half, held_out)
 
 

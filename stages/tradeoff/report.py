@@ -44,8 +44,8 @@ def write_report(folder: Path, name: str, tradeoff: Tradeoff, inputs: TradeoffIn
     introduction = (
         f"Quality is the PSNR of {len(tradeoff.scores)} held-out views, which training never saw, "
         f'drawn {tradeoff.side_px} pixels large. What stands after "{OTHER_VIEWS}" holds the mean '
-        "change over other views of this scene in nine of ten cases. It is not about another run "
-        "with another seed."
+        "change over a dozen other views of this scene in nine of ten cases. It is not about "
+        "another run with another seed."
     )
     parts = [html.paragraphs([introduction])]
     for stem, (title, about) in _SECTIONS.items():

@@ -43,11 +43,12 @@ def test_a_single_view_says_nothing_of_others_without_training_views():
 
 def test_training_views_say_how_far_views_differ_and_not_by_how_much():
     """By hand: the held-out views agree, and the training views' deviation is 0.8 about another
-    mean. Each is unlike its neighbours, which so say nothing. The variance is
-    (5 x 1.25^2 x 0.8^2) / (2 + 5) / 3, and Student's factor 1.8946."""
+    mean. Each is unlike its neighbours, which so say nothing. The variance of a view is
+    (5 x 1.25^2 x 0.8^2) / (2 + 5), that of three and of twelve others 1/3 + 1/12 of it, and
+    Student's factor 1.8946."""
     found = difference([0.5] * 3, 7.0 + 0.8 * math.sqrt(5 / 6) * np.array([1, -1] * 3))
     assert found.mean == 0.5
-    assert found.high - 0.5 == pytest.approx(1.8946 * math.sqrt(5 / 21), abs=1e-4)
+    assert found.high - 0.5 == pytest.approx(1.8946 * math.sqrt(5 / 7 * 5 / 12), abs=1e-4)
     assert found.low == pytest.approx(1.0 - found.high)
 
 
@@ -60,7 +61,11 @@ def test_what_neighbours_tell_is_subtracted():
     found = paired_difference(rising, 3)
     assert found.mean == 4.5
     assert (found.low + found.high) / 2 == pytest.approx(np.mean(training) + 0.5, abs=0.2)
-    assert found.high - found.low < 1.0  # 8 for the three alone
+    names = np.random.default_rng(0).permutation(24)
+    unordered = paired_difference(
+        {f"{n:03d}": x for n, x in zip(names, rising.values(), strict=True)}, 3
+    )
+    assert found.high - found.low < 0.8 * (unordered.high - unordered.low)
 
 
 def views(random, count, mean, scale):
@@ -77,20 +82,22 @@ def views(random, count, mean, scale):
 
 @pytest.mark.parametrize("count", [1, 3, 12])
 def test_the_interval_holds_the_truth_about_as_often_as_it_says(count):
-    """Training views have another mean and four fifths of the deviation."""
+    """Training views have another mean and four fifths of the deviation. The truth is the mean of
+    a dozen views at places of the path that are not held out."""
     random, held, widths, alone = np.random.default_rng(3), 0, [], []
     for _ in range(400):
         all_views = views(random, 8 * count, 0.0, 1.0)
         held_out = all_views[::8] + 0.4
         training = np.delete(0.8 * all_views, slice(None, None, 8)) - 0.3
         found = difference(held_out, training, mixed=True)
-        held += found.low <= 0.4 + all_views.mean() <= found.high
+        others = random.choice(np.delete(all_views, slice(None, None, 8)), 12) + 0.4
+        held += found.low <= others.mean() <= found.high
         widths.append(found.high - found.low)
         if count > 1:
             alone.append(held_out.std(ddof=1) / math.sqrt(count))
-    assert CONFIDENCE - 0.03 <= held / 400 <= 1.0
+    assert CONFIDENCE - 0.05 <= held / 400 <= 0.97
     if count == 3:
-        assert np.mean(widths) < 0.5 * np.mean(alone) * 2 * 2.92  # Student's, of the three alone
+        assert np.mean(widths) < 0.6 * np.mean(alone) * 2 * 2.92  # Student's, of the three alone
 
 
 def test_no_values_and_values_that_are_not_finite_are_refused():
