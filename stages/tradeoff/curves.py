@@ -103,8 +103,8 @@ def change_of(
     """Of one `figure` of the same views in the same order: so many held-out ones, then training
     views."""
     pairs = zip(scores, baseline, strict=True)
-    changes = {a.name: getattr(a, figure) - getattr(b, figure) for a, b in pairs}
-    return paired_difference(changes, held_out)
+    changes = [getattr(a, figure) - getattr(b, figure) for a, b in pairs]
+    return paired_difference(changes[:held_out], changes[held_out:])
 
 
 def time_to(history: Sequence[HistoryPoint], below_db: float) -> tuple[float, float]:

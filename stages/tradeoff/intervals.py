@@ -4,11 +4,10 @@ mostly dB of PSNR), and an interval of their mean over a dozen other views of th
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 from scipy.special import stdtrit
 
 CONFIDENCE = 0.9
@@ -17,7 +16,7 @@ OTHER_VIEWS = f"other views, {100 * CONFIDENCE:.0f} %"  # what an interval is of
 TRAINING_VIEWS = 24  # at most, evenly spaced, that say how differences vary in a scene
 # Differences of held-out views vary so many times as far as those of training views, whose variance
 # counts as that of so many more held-out views: docs/experiments/evaluation.md.
-_WIDER, _WORTH = 1.25, 5
+_WIDER, _WORTH = 1.2, 5
 BETTER, WORSE, INCONCLUSIVE = "better", "worse", "no significant difference"
 
 
@@ -50,59 +49,33 @@ class Difference:
         return WORSE if self.high < 0 else INCONCLUSIVE
 
 
-def paired_difference(differences: Mapping[str, float], held_out: int) -> Difference:
+def paired_difference(held_out: ArrayLike, training: ArrayLike) -> Difference:
     """The mean of differences (candidate minus baseline, larger is better) and its interval.
 
     Few views do not say how far views differ. Training views do: their mean is not that of unseen
-    views, but their variance is close to it. And neighbours in the order of names show much the
-    same. So what training views tell of their neighbours is subtracted from every difference (a
-    control variate), and the interval is Student's, of the rest. It is a prediction: other views
-    have an error of their own, so that whoever measures `OTHERS` more can tell whether it is right.
+    views, but their variance is close to it. The sums of squares of both are joined, as those of
+    two samples of one variance are, and the interval is Student's for the difference of two means:
+    that of the held-out views and that of `OTHERS`.
 
     Args:
-        differences: by name of the view. The first `held_out` are of views that no result was
-            trained on, the others of views that both were trained on.
-        held_out: how many; at least one.
+        held_out: [views], of views that no result was trained on.
+        training: [views], of views that both were trained on.
 
     Raises:
-        ValueError: there are none, or one is not finite.
+        ValueError: there is no held-out view, or a difference is not finite.
     """
-    if not 0 < held_out <= len(differences) or not np.isfinite([*differences.values()]).all():
+    unseen, seen = np.asarray(held_out, np.float64), np.asarray(training, np.float64)
+    if not unseen.size or not (np.isfinite(unseen).all() and np.isfinite(seen).all()):
         raise ValueError("differences must be of one held-out view at least, all finite")
-    values = np.array([*differences.values()])
-    mean, trained = float(values[:held_out].mean()), len(values) - held_out
-    if trained < 2:
-        return Difference(mean, -math.inf, math.inf, held_out)
-    slope, rest = _less_neighbours(differences, held_out)
-    worth = min(_WORTH, trained - 1)
-    freedom = held_out - 1 + worth
-
-    def variance(x: NDArray[np.float64]) -> float:
-        squares = worth * _WIDER**2 * x[held_out:].var(ddof=1)
-        return float(squares + held_out * x[:held_out].var()) / freedom
-
-    of_mean = variance(rest) * (1 / held_out + slope**2 / trained)
-    half = half_width(of_mean + variance(values) / max(OTHERS, held_out), freedom)
-    centre = float(rest[:held_out].mean() + slope * values[held_out:].mean())
-    return Difference(mean, centre - half, centre + half, held_out)
+    mean, views, worth = float(unseen.mean()), len(unseen), min(_WORTH, len(seen) - 1)
+    if worth < 1:
+        return Difference(mean, -math.inf, math.inf, views)
+    squares = views * unseen.var() + worth * _WIDER**2 * seen.var(ddof=1)
+    freedom = views - 1 + worth
+    half = half_width(squares / freedom * (1 / views + 1 / max(OTHERS, views)), freedom)
+    return Difference(mean, mean - half, mean + half, views)
 
 
 def half_width(variance: float, freedom: int) -> float:
-    """Of Student's interval of a mean, from its variance and the degrees of freedom of that."""
+    """Of Student's interval, from the variance of its middle and the degrees of freedom of that."""
     return float(stdtrit(freedom, (1 + CONFIDENCE) / 2)) * math.sqrt(variance)
-
-
-def _less_neighbours(
-    differences: Mapping[str, float], held_out: int
-) -> tuple[float, NDArray[np.float64]]:
-    """How much of what training views tell of a neighbour is true, from 0 to 1, and each difference
-    less that. A training view is told of by the others."""
-    order = {name: float(place) for place, name in enumerate(sorted(differences))}
-    at, values = np.array([(order[name], x) for name, x in differences.items()]).T
-    trained = sorted(zip(at[held_out:], values[held_out:], strict=True))
-    others = (np.array([pair for pair in trained if pair[0] != place]).T for place in at)
-    neighbours = np.array([np.interp(place, *some) for place, some in zip(at, others, strict=True)])
-    known, seen = neighbours[held_out:], values[held_out:]
-    spread, covariance = known.var(), np.mean((known - known.mean()) * (seen - seen.mean()))
-    slope = min(1.0, max(0.0, float(covariance / spread))) if spread else 0.0
-    return slope, values - slope * neighbours

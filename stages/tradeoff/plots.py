@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from stages.base.plots import BLUE, GREY, ORANGE, new_plot, write_plot
 from stages.tradeoff.curves import Tradeoff
 from stages.tradeoff.intervals import OTHER_VIEWS
@@ -50,17 +48,18 @@ def _splats(tradeoff: Tradeoff) -> Figure:
     figure, axes = new_plot(title, "splats", _PSNR)
     points, at = tradeoff.pruned, tradeoff.knee
     counts = [point.splats for point in points]
-    axes.plot(counts, [p.psnr_db for p in points], "o-", color=BLUE, linewidth=1, ms=5)
-    shown = [point for point in points[1:] if point.change.shown]
-    if shown:
-        low, high = np.array([(p.change.low, p.change.high) for p in shown]).T
-        middle, half = points[0].psnr_db + (low + high) / 2, (high - low) / 2
-        at_points = [point.splats for point in shown]
-        axes.errorbar(at_points, middle, half, fmt="none", capsize=3, label=OTHER_VIEWS)
+    axes.plot(counts, [p.psnr_db for p in points], "-", color=BLUE, linewidth=1)
+    for point in points[1:]:
+        low, high = point.change.mean - point.change.low, point.change.high - point.change.mean
+        bars = [[low], [high]] if point.change.shown else None
+        at_point = [point.splats], [point.psnr_db]
+        axes.errorbar(*at_point, yerr=bars, fmt="o", color=BLUE, ms=5, elinewidth=1, capsize=3)
     axes.plot(counts[:1], [points[0].psnr_db], "D", color=ORANGE, label="this run")
     if at:
         knee_at = [counts[at]], [points[at].psnr_db]
         axes.plot(*knee_at, "o", ms=13, mfc="none", color=ORANGE, label="knee")
+    if points[-1].change.shown:
+        axes.errorbar([], [], yerr=[], fmt="o", color=BLUE, label=OTHER_VIEWS)
     axes.legend()
     axes.xaxis.set_major_formatter("{x:,.0f}")
     return figure

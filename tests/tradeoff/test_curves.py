@@ -49,13 +49,8 @@ def test_a_curve_that_gains_more_and_more_has_no_knee():
     assert knee([8, 4, 2, 1], [16, 12, 10.5, 10]) == 0
 
 
-def change_by(held_out, training):
-    named = {str(number): db for number, db in enumerate([*held_out, *training])}
-    return paired_difference(named, len(held_out))
-
-
 def test_a_loss_is_a_cost_and_its_interval_has_the_same_sign():
-    change = change_by([-0.2, -0.22, -0.18, -0.2, -0.21, -0.19], [-0.2, -0.22, -0.18])
+    change = paired_difference([-0.2, -0.22, -0.18, -0.2, -0.21, -0.19], [-0.2, -0.22, -0.18])
     text = report_text.costs(change)
     assert text.startswith("costs 0.20 dB (other views, 90 %: 0.1")
     low, high = (float(x) for x in text.split("%: ")[1].rstrip(")").split(" to "))
@@ -63,8 +58,8 @@ def test_a_loss_is_a_cost_and_its_interval_has_the_same_sign():
 
 
 def test_a_single_view_has_no_interval():
-    assert report_text.costs(change_by([-0.2], [])) == "costs 0.20 dB (of 1 photograph)"
-    assert report_text.costs(change_by([0.2], [])) == "gains 0.20 dB (of 1 photograph)"
+    assert report_text.costs(paired_difference([-0.2], [])) == "costs 0.20 dB (of 1 photograph)"
+    assert report_text.costs(paired_difference([0.2], [])) == "gains 0.20 dB (of 1 photograph)"
 
 
 def empty_coverage() -> Coverage:
@@ -76,12 +71,12 @@ def empty_coverage() -> Coverage:
 
 @pytest.mark.parametrize("logged", [0, 1])
 def test_a_run_without_a_log_says_so(logged):
-    own = OperatingPoint("as it is", 100, 20.0, change_by([0.0] * 3, []))
+    own = OperatingPoint("as it is", 100, 20.0, paired_difference([0.0] * 3, []))
     course = tuple(history(20.0)[:logged])
     tradeoff = Tradeoff(own, course, (), (own,), (), 480, empty_coverage())
     assert report_text.about_time(tradeoff) == [report_text.NO_TIMES]
 
 
 def test_a_single_view_has_an_interval_where_training_views_say_how_far_views_differ() -> None:
-    one = change_by([-0.2], [-0.3, -0.31, -0.29])
+    one = paired_difference([-0.2], [-0.3, -0.31, -0.29])
     assert report_text.costs(one) == "costs 0.20 dB (other views, 90 %: 0.16 to 0.24)"
