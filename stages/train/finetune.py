@@ -25,6 +25,7 @@ from stages.train.colour_refit import ColourRefit, needs_colour_refit
 from stages.train.conversion import model_of
 from stages.train.dropout import Dropout
 from stages.train.optimiser import LearningRates, Model, camera_distances
+from stages.train.schedule import FULL, HALF, SCALES, SMALLER_STEPS, SMALLER_STEPS_PERIOD
 from stages.train.steps.step import StepInput, step_of
 from stages.train.views import Level
 
@@ -43,7 +44,8 @@ class FineTuner:
         backend: name of the rasteriser.
         report: says before each step whether to stop.
         dropout: whether to use dropout, and to refit colours afterwards, as training did.
-        half_size: whether every second step uses its view at half the size.
+        half_size: whether every second step uses its view at half the size. Otherwise steps use
+            smaller views as often as training does, and none of the last three of a call does.
         rates: as `RATES`.
     """
 
@@ -61,7 +63,7 @@ class FineTuner:
         self.half_size, self.rates, self.cameras = half_size, rates, [view.camera for view in views]
         self.steps = 0  # done in all calls; the order of views and dropout depend on it
         # By view and size: steps tell views apart by these objects.
-        self._means: dict[tuple[int, bool], NDArray[np.float32]] = {}
+        self._means: dict[tuple[int, int], NDArray[np.float32]] = {}
         self._stepper, self._rasteriser = step_of(backend), rasteriser_of(backend)
 
     def finetune(
@@ -98,8 +100,9 @@ class FineTuner:
                 self.extent,
             )
             rates = replace(rates, **dict.fromkeys(frozen, 0.0))
-            given = StepInput(self._next_level(), settings, rates, dropout=self._dropout())
-            self._stepper.step(given)
+            size, weight = self._size(steps - number)
+            level, dropout = self._next_level(size), self._dropout()
+            self._stepper.step(StepInput(level, settings, rates, dropout=dropout, weight=weight))
         found = _with_frozen(self._to_splats(self._stepper.model(), splats), splats, frozen)
         if needs_colour_refit(self.dropout, len(self.views)) and "sh_dc" not in frozen:
             found = self._refit_colours(found, settings, "sh_rest" in frozen)
@@ -117,13 +120,21 @@ class FineTuner:
         key = int(np.random.default_rng([8, self.steps]).integers(1 << 32))
         return Dropout(len(self.views), key)
 
-    def _next_level(self) -> Level:
-        number, half = divmod(self.steps, 2) if self.half_size else (self.steps, 0)
+    def _size(self, left: int) -> tuple[int, float]:
+        """(index into `SCALES`, factor of the gradients) of the next step, with which `left` steps
+        of a call are left."""
+        if self.half_size:
+            return (HALF if self.steps % 2 else FULL), 1.0
+        size = SMALLER_STEPS.get(left % SMALLER_STEPS_PERIOD, FULL)
+        return size, SCALES[size] ** -2
+
+    def _next_level(self, size: int) -> Level:
+        number = self.steps // 2 if self.half_size else self.steps
         epoch, place = divmod(number, len(self.views))
         self.steps += 1
         row = int(np.random.default_rng([7, epoch]).permutation(len(self.views))[place])
-        level = _level_of(self.views[row].scaled(0.5 if half else 1.0))
-        return replace(level, means=self._means.setdefault((row, bool(half)), level.means))
+        level = _level_of(self.views[row].scaled(SCALES[size]))
+        return replace(level, means=self._means.setdefault((row, size), level.means))
 
     def _to_splats(self, model: Model, before: Splats) -> Splats:
         """With unit quaternions, all N rows. No splat is finer than its views can show, unless it
