@@ -63,7 +63,7 @@ class QuantiseSettings:
 
 STAGE = Stage(
     "quantise",
-    version=16,
+    version=17,
     reads=("sfm", "train", "prune"),
     settings_type=QuantiseSettings,
     adds="formats",

@@ -124,7 +124,7 @@ PRESETS: dict[str, TrainSettings] = {
 
 STAGE = Stage(
     "train",
-    version=36,
+    version=37,
     reads=("sfm", "seed"),
     settings_type=TrainSettings,
     **in_module("stages.train.stage"),
