@@ -17,12 +17,19 @@ from pathlib import Path
 import psutil
 
 MIB = 1024.0 * 1024.0
+_TRAINING_BYTES = 1600  # a splat
 _SELF = Path("/proc/self")
 
 
 def available_mib() -> float:
     """Memory that can be allocated without swapping, MiB."""
     return float(psutil.virtual_memory().available) / MIB
+
+
+def training_mib(splats: int) -> float:
+    """Memory that `splats` splats take in training: parameters, moments, gradients, footprint and
+    about 6 intersections. Drawing them takes half of it."""
+    return splats * _TRAINING_BYTES / MIB
 
 
 def resident_mib(pid: int | None = None) -> float:

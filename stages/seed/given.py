@@ -17,9 +17,10 @@ from pathlib import Path
 import numpy as np
 
 from stages import formats
-from stages.base.errors import SplatError
+from stages.base.errors import ResourceError, SplatError
+from stages.base.memory import MIB, available_mib, training_mib
 from stages.base.stage import Report
-from stages.base.text import counted
+from stages.base.text import counted, size
 from stages.evaluate.evaluation import EvaluationView, load_evaluation_views, mean_psnr_db
 from stages.evaluate.image_metrics import psnr
 from stages.raster.backends import AUTO
@@ -39,7 +40,7 @@ def given_splats(path: Path, reconstruction: Reconstruction, report: Report) -> 
 
     Raises SplatError as `check_given`, `formats.read` and `world_of_run`, and
     "seed-splats-do-not-fit" where a picture of one colour is nearer to the photographs than any
-    reading.
+    reading, and "seed-splats-memory".
     """
     check_given(path, reconstruction.file_from_world is not None)
     splats, worlds, drawings = _readings(path, reconstruction, report)
@@ -82,6 +83,7 @@ def _readings(
                 "seed-splats-dropped",
                 f"{counted(dropped, 'splat')} of {path.name} cannot be drawn and are left out.",
             )
+        _check_memory(path, len(splats))
         _warn_of_held_out(len(held_out), "may have been", report)
         return splats, worlds_of(path, reconstruction), (False, True)
     splats, earlier = load_splats(path), load_reconstruction(run / _SFM)
@@ -90,6 +92,20 @@ def _readings(
         _warn_of_held_out(known, "were", report)
     world = world_of_run(earlier, reconstruction)
     return splats, [world], (splats.draw_settings.antialias,)
+
+
+def _check_memory(path: Path, splats: int) -> None:
+    """Raise SplatError "seed-splats-memory" for more splats than this machine can go on with."""
+    needed, free = training_mib(splats), available_mib()
+    if needed > free:
+        raise ResourceError(
+            "seed-splats-memory",
+            given=f"{path} holds {splats:,} splats: measuring and pruning them takes up to "
+            f"{size(needed * MIB)}, and {size(free * MIB)} of memory are free.",
+            wanted="Splats that fit into memory.",
+            hint="Close other programs, or merge splats first: "
+            f"splat edit {path.name} smaller.ply --decimate {int(free / training_mib(1) / 2)}",
+        )
 
 
 def _warn_of_held_out(photographs: int, were: str, report: Report) -> None:

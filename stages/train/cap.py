@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from stages.base.atomic import replacing
-from stages.base.memory import available_mib
+from stages.base.memory import available_mib, training_mib
 from stages.scene import Camera, parameters_per_splat
 from stages.train.optimiser import Model
 
@@ -22,7 +22,6 @@ FILE_NAME = "cap.json"
 FREE_MEMORY = "free memory"
 DEVICE_MEMORY = "the GPU's memory"
 PHOTOGRAPHS = "the photographs' pixels"
-BYTES_PER_SPLAT = 1600  # parameters, moments, gradients, footprint and about 6 intersections
 MIN_CAP = 10_000  # splats that are always allowed
 BASE_MIB = 2048.0  # libraries, and at most 1 GiB of photographs
 
@@ -44,17 +43,12 @@ class Cap:
 
 def splat_cap(free_mib: float) -> int:
     """How many splats can be trained in half of the free memory."""
-    return max(MIN_CAP, int(0.5 * free_mib * 1024 * 1024 / BYTES_PER_SPLAT))
-
-
-def memory_mib(splats: int) -> float:
-    """Memory that `splats` splats take in training."""
-    return splats * BYTES_PER_SPLAT / (1024 * 1024)
+    return max(MIN_CAP, int(0.5 * free_mib / training_mib(1)))
 
 
 def needed_mib(splats: int) -> float:
     """Memory of one run, all its stages, that trains at most `splats` splats."""
-    return BASE_MIB + memory_mib(splats)
+    return BASE_MIB + training_mib(splats)
 
 
 def cap_for(folder: Path, max_splats: int, determined: int) -> Cap:

@@ -18,7 +18,7 @@ import numpy as np
 from stages.base.atomic import replacing
 from stages.base.bad_files import reading, stage_output
 from stages.base.errors import QualityError, ResourceError, SplatError
-from stages.base.memory import MIB
+from stages.base.memory import MIB, training_mib
 from stages.base.stage import Report
 from stages.base.text import counted, size
 from stages.evaluate.verdict import WRONG
@@ -34,7 +34,6 @@ from stages.train.cap import (
     FREE_MEMORY,
     Cap,
     lower_cap,
-    memory_mib,
     remove_cap,
 )
 from stages.train.charts import transients_sheet
@@ -167,7 +166,7 @@ def _report_cap(cap: Cap, densified: int, report: Report) -> None:
         report.warn(
             "train-splat-cap-reached",
             f"Free memory ({size((cap.free_mib or 0) * MIB)}) limited training to {cap.splats:,} "
-            f"splats; 100,000 more take {size(memory_mib(100_000) * MIB)}.",
+            f"splats; 100,000 more take {size(training_mib(100_000) * MIB)}.",
         )
 
 

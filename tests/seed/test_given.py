@@ -18,7 +18,7 @@ from stages.raster.draw import render
 from stages.raster.similarity import Similarity, rotation_about
 from stages.scene import DrawSettings, Splats
 from stages.scene.storage import save_splats
-from stages.seed import stage
+from stages.seed import given, stage
 from stages.seed.given import given_splats
 from stages.seed.settings import SeedSettings
 from stages.seed.worlds import NERFSTUDIO
@@ -189,6 +189,17 @@ def test_what_cannot_be_drawn_is_left_out_and_said(scene: SmallScene, tmp_path: 
         "seed-splats-dropped",
         "seed-held-out-unknown",
     ]
+
+
+def test_more_splats_than_memory_holds_are_refused_before_they_are_drawn(
+    scene: SmallScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = written(tmp_path, scene.splats, TO_FILE)
+    monkeypatch.setattr(given, "available_mib", lambda: 0.1)
+    with pytest.raises(SplatError) as caught:
+        given_splats(path, scene.reconstruction, Report())
+    assert caught.value.code == "seed-splats-memory"
+    assert "--decimate 32" in caught.value.hint  # half of what 0.1 MiB hold
 
 
 def earlier_run(folder: Path, scene: SmallScene, moved: Similarity) -> Path:

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from stages.base.memory import training_mib
 from stages.scene import logit
-from stages.train.cap import BYTES_PER_SPLAT, splat_cap
+from stages.train.cap import splat_cap
 from stages.train.density import (
     CHILD_LENGTH,
     CHILD_OFFSET,
@@ -120,7 +121,7 @@ def test_the_threshold_is_the_published_one_and_falls_with_the_root_of_a_long_ru
 
 
 def test_the_cap_takes_half_of_the_free_memory():
-    assert splat_cap(8192.0) == pytest.approx(4096 * 1024 * 1024 / BYTES_PER_SPLAT, rel=1e-3)
+    assert splat_cap(8192.0) == pytest.approx(4096 / training_mib(1), rel=1e-3)
     assert splat_cap(1.0) == 10_000
 
 
