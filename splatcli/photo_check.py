@@ -8,6 +8,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from splatcli import console, log, progress, run_result, run_settings
+from splatcli.input_files import check_files
 from stages.base.errors import QualityError
 from stages.evaluate.verdict import WRONG
 from stages.formats import format_of
@@ -31,7 +32,7 @@ def check_on_photos(file: Path, photos: Path, options: dict[str, Any]) -> None:
     """
     given = {"splats": file, "train_side": SIDE, "max_side": SIDE, **options}
     settings = run_settings.of_new_run(given)
-    run_settings.check_files(settings)
+    check_files(settings)
     with TemporaryDirectory(prefix="splat-") as folder:
         pipeline = Pipeline(Path(folder) / "run", photos)
         listeners = Listeners(log.LogListener(), progress.listener_for(console.mode))

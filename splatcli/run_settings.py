@@ -12,13 +12,10 @@ import typer
 from splatcli import console, options
 from stages.base.errors import UsageError
 from stages.base.settings import UNSET, Setting, changed, settings_of
-from stages.cameras.camera_formats import read_cameras
 from stages.raster.backends import backend_of
 from stages.run.pipeline import Pipeline
 from stages.run.runfolder import is_run_folder
 from stages.run.stages import STAGE_NAMES, STAGE_OF, options_of
-from stages.seed.settings import check_given
-from stages.sfm.known.match_cameras import check_split
 from stages.train.settings import PRESETS, TrainSettings
 
 DEFAULT_PRESET = "standard"
@@ -146,16 +143,6 @@ def of_new_run(given: Mapping[str, Any]) -> dict[str, Any]:
     SplatError."""
     others = {name: value for name, value in given.items() if name != "preset"}
     return combined(defaults(), others, given.get("preset"))
-
-
-def check_files(settings: Mapping[str, Any]) -> None:
-    """Raise SplatError for known cameras and given splats that no run could use: now, before
-    photographs are read. settings: by stage name."""
-    sfm, splats = settings["sfm"], settings["seed"].splats
-    if sfm.cameras is not None:
-        check_split(read_cameras(sfm.cameras), sfm.split)
-    if splats is not None:
-        check_given(splats, has_cameras=sfm.cameras is not None)
 
 
 def training_summary(settings: TrainSettings, given: Mapping[str, Any], preset: str | None) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 from splatcli import console, log, options, progress, run_result, run_settings
 from splatcli.arguments import Cluster, Out, Photos, Run
 from splatcli.folders import DEFAULT, find_run_folder, run_folder_for
+from splatcli.input_files import check_files
 from stages.base.errors import UsageError
 from stages.base.settings import UNSET, changed
 from stages.run import runfolder
@@ -46,7 +47,7 @@ def process(
     is_known = runfolder.is_run_folder(run_folder)
     settings = run_settings.combined(run_settings.recorded(pipeline), given, preset)
     if given.keys() & {"cameras", "splats"}:
-        run_settings.check_files(settings)
+        check_files(settings)
     if is_known and console.mode.has_notes:
         console.note(run_settings.training_summary(settings["train"], given, preset))
     _run(pipeline, settings, view=view)
