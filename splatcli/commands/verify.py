@@ -82,7 +82,11 @@ def verify(
         return
     if cameras is not None:
         raise _two_originals()
-    files = _files(target)
+    _verify_files(_files(target), against)
+
+
+def _verify_files(files: list[Path], against: Path | None) -> None:
+    """Compare each file with its original, and print what was found."""
     for file in files:
         formats.format_of(file)  # raises before any work is done
     console.note_compiling()

@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from stages.base.stage import Report
 from stages.base.text import counted
-from stages.evaluate.evaluation import load_evaluation_views
+from stages.evaluate.evaluation import EvaluationView, load_evaluation_views
 from stages.raster.backends import backend_of
-from stages.scene import Reconstruction, Splats, draw_settings_of, split_held_out, training_extent
+from stages.scene import (
+    Camera,
+    Reconstruction,
+    Splats,
+    draw_settings_of,
+    split_held_out,
+    training_extent,
+)
 from stages.scene.light import spread_ev
 from stages.train.camera_refinement import CameraRefinement
-from stages.train.cap import DEVICE_MEMORY, cap_for, splats_determined
+from stages.train.cap import Cap, cap_for, splats_determined
 from stages.train.schedule import DENSIFYING_PART, LAST_PART, Schedule
 from stages.train.settings import TrainSettings
 from stages.train.trainer import Trainer, TrainingTask
@@ -41,21 +48,13 @@ def make_trainer(
     sh_degree = max(settings.sh_degree if settings.steps else 0, start.sh_degree)
     draw_settings = draw_settings_of(reconstruction.views, settings.train_side, light, antialias)
     held_out = load_evaluation_views(reconstruction.folder, held, draw_settings)
-    if settings.steps:
-        _warn_of_small_photographs(reconstruction, settings.train_side, report)
-    determined = splats_determined([view.levels[-1].camera for view in train], sh_degree)
-    since = _part(settings)
-    cap = cap_for(folder, len(start) if since == LAST_PART else settings.max_splats, determined)
-    if given and cap.origin != DEVICE_MEMORY:
-        cap = replace(cap, splats=max(cap.splats, len(start)))
+    _warn_of_small_photographs(reconstruction, settings, report)
+    cameras = {view.name: view.levels[-1].camera for view in train}
+    cap = _cap(start, settings, folder, splats_determined([*cameras.values()], sh_degree))
     report.metric("splat_cap_free_mib", cap.free_mib)
-    extent, backend = training_extent(reconstruction), settings.backend
-    refinement = None
-    if settings.refine_in_training:
-        cameras = {view.name: view.levels[-1].camera for view in train}
-        cameras |= {view.name: view.camera for view in held_out}
-        refinement = CameraRefinement.of(cameras, extent)
-        backend = _on_the_host(backend, report)
+    extent = training_extent(reconstruction)
+    refinement = _refinement(settings, cameras, held_out, extent)
+    backend = settings.backend if refinement is None else _on_the_host(settings.backend, report)
     task = TrainingTask(
         views=train,
         held_out=held_out,
@@ -75,7 +74,7 @@ def make_trainer(
         sh_degree=sh_degree,
         n_start=min(len(start), cap.splats),
         seed=settings.seed,
-        since=since,
+        since=_part(settings),
     )
     return Trainer(task, schedule, cap, refinement)
 
@@ -87,9 +86,31 @@ def _part(settings: TrainSettings) -> tuple[int, float]:
     return DENSIFYING_PART if settings.densify or settings.within else LAST_PART
 
 
+def _cap(start: Splats, settings: TrainSettings, folder: Path, determined: int) -> Cap:
+    if settings.splats is None:
+        return cap_for(folder, settings.max_splats, determined)
+    most = len(start) if _part(settings) == LAST_PART else settings.max_splats
+    return cap_for(folder, most, determined).for_given(len(start))
+
+
+def _refinement(
+    settings: TrainSettings,
+    cameras: Mapping[str, Camera],
+    held_out: Sequence[EvaluationView],
+    extent: float,
+) -> CameraRefinement | None:
+    """cameras: of the training views, by name."""
+    if not settings.refine_in_training:
+        return None
+    return CameraRefinement.of({**cameras, **{v.name: v.camera for v in held_out}}, extent)
+
+
 def _warn_of_small_photographs(
-    reconstruction: Reconstruction, train_side: int, report: Report
+    reconstruction: Reconstruction, settings: TrainSettings, report: Report
 ) -> None:
+    if not settings.steps:
+        return
+    train_side = settings.train_side
     sides = [max(view.camera.width, view.camera.height) for view in reconstruction.views]
     if smaller := sum(side < train_side for side in sides):
         report.warn(

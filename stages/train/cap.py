@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +39,12 @@ class Cap:
     splats: int
     origin: str
     free_mib: float | None = None
+
+    def for_given(self, splats: int) -> Cap:
+        """At least so many, which were trained before: only a GPU's memory leaves some out."""
+        if self.origin == DEVICE_MEMORY or self.splats >= splats:
+            return self
+        return replace(self, splats=splats)
 
 
 def splat_cap(free_mib: float) -> int:
