@@ -52,6 +52,7 @@ class Options(TypedDict, total=False):
     crs: str
     max_minutes: float
     splats: Path | None
+    densify: bool
     fill: bool
     steps: int
     steps_per_view: int

@@ -7,8 +7,9 @@ an earlier run follows from the photographs that both runs have.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +17,9 @@ from numpy.typing import NDArray
 from stages.base.bad_files import reading
 from stages.base.errors import SplatError
 from stages.base.text import counted
+from stages.cameras import inria
 from stages.raster.similarity import Similarity, rotation_to_up
-from stages.scene import Reconstruction
+from stages.scene import Camera, Reconstruction, View
 
 NERFSTUDIO = "dataparser_transforms.json"  # beside the splats: how their world was normalised
 _FEWEST_POINTS = 4  # that have principal axes
@@ -47,6 +49,7 @@ def worlds_of(path: Path, reconstruction: Reconstruction) -> list[World]:
         worlds.append(
             World("nerfstudio's normalised world", to_run.after(_of_nerfstudio(path.parent)))
         )
+    worlds += _of_cameras_beside(path, reconstruction, known=to_run)
     worlds.append(World("OpenSplat's centred world", to_run.after(_of_opensplat(reconstruction))))
     if len(reconstruction.points) < _FEWEST_POINTS:
         return worlds
@@ -57,16 +60,29 @@ def worlds_of(path: Path, reconstruction: Reconstruction) -> list[World]:
     return worlds
 
 
+def _of_cameras_beside(
+    path: Path, reconstruction: Reconstruction, known: Similarity
+) -> list[World]:
+    """The world of a cameras.json beside the splats, or two folders above, where the reference
+    trainer writes it; none where it is the `known` one."""
+    worlds = []
+    for folder in (path.parent, *path.parents[2:3]):
+        if file := inria.locate(folder):
+            pairs = _pairs(inria.read(file).views, reconstruction)
+            if len(pairs) < _FEWEST_SHARED:
+                continue
+            found = _between(pairs)
+            if not np.allclose(found.inverse_matrix, known.inverse_matrix, rtol=1e-4, atol=1e-4):
+                worlds.append(World(f"the world of {file.name}", found))
+    return worlds
+
+
 def world_of_run(earlier: Reconstruction, reconstruction: Reconstruction) -> World:
     """The world of an earlier run, from the cameras of the photographs that both runs have.
 
-    First the rotation and then scale and offset have the least sum of distances (not of their
-    squares) between the cameras, so that one that an attempt placed elsewhere does not count.
-    Raises SplatError "seed-splats-do-not-fit" where fewer than three photographs have the same
-    name in both.
+    Raises SplatError "seed-splats-do-not-fit" where fewer than three have the same name in both.
     """
-    cameras = {view.name: view.camera for view in reconstruction.views}
-    pairs = [(v.camera, cameras[v.name]) for v in earlier.views if v.name in cameras]
+    pairs = _pairs(earlier.views, reconstruction)
     if len(pairs) < _FEWEST_SHARED:
         raise SplatError(
             "seed-splats-do-not-fit",
@@ -75,6 +91,28 @@ def world_of_run(earlier: Reconstruction, reconstruction: Reconstruction) -> Wor
             wanted=f"At least {_FEWEST_SHARED}, to bring the splats into this run's world.",
             hint="Give the photographs of that run, with others added if you like.",
         )
+    found = _between(pairs)
+    # cameras and means are relative to each run's own origin; `given` moves what includes it
+    offset = found.offset - found.scale * found.rotation @ earlier.origin
+    return World("the earlier run's world", replace(found, offset=offset))
+
+
+def _pairs(views: Sequence[View], reconstruction: Reconstruction) -> list[tuple[Camera, Camera]]:
+    """(camera elsewhere, camera in this run) of the photographs of one name, suffixes apart."""
+    cameras = {_stem(view.name): view.camera for view in reconstruction.views}
+    return [(v.camera, cameras[_stem(v.name)]) for v in views if _stem(v.name) in cameras]
+
+
+def _stem(name: str) -> str:
+    return str(PurePosixPath(name).with_suffix(""))
+
+
+def _between(pairs: Sequence[tuple[Camera, Camera]]) -> Similarity:
+    """The similarity that takes the first cameras nearest the second.
+
+    First the rotation and then scale and offset have the least sum of distances (not of their
+    squares), so that a camera that one of them has elsewhere does not count.
+    """
     turns = np.array([n.world_to_camera[:3, :3].T @ o.world_to_camera[:3, :3] for o, n in pairs])
     rotation, weights = np.eye(3), np.ones(len(pairs))
     for _ in range(_REWEIGHTED):
@@ -89,12 +127,7 @@ def world_of_run(earlier: Reconstruction, reconstruction: Reconstruction) -> Wor
         scale = float((weights @ (apart * apart_new).sum(1)) / (weights @ (apart**2).sum(1)))
         offset = middles[1] - scale * middles[0]
         weights = _inverse(np.linalg.norm(new - scale * old - offset, axis=1))
-    in_means = Similarity(scale, rotation, offset)
-    # cameras and means are relative to each run's own origin; `given` moves what includes it
-    return World(
-        "the earlier run's world",
-        replace(in_means, offset=offset - scale * rotation @ earlier.origin),
-    )
+    return Similarity(scale, rotation, offset)
 
 
 def _inverse(residuals: NDArray[np.float64]) -> NDArray[np.float64]:

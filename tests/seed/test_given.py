@@ -108,6 +108,39 @@ def test_nerfstudios_normalised_world_is_read_from_beside_the_splats(
     assert NERFSTUDIO in caught.value.given
 
 
+@pytest.mark.parametrize("below", [".", "point_cloud/iteration_30000"])
+def test_the_world_of_a_cameras_json_beside_the_splats_is_read(
+    scene: SmallScene, tmp_path: Path, below: str
+) -> None:
+    """As gsplat's forks and OpenSplat write it, and two folders up as the reference trainer does;
+    names lack their suffix there."""
+    unknown = Similarity(0.013, rotation_about(np.array([1.0, -2.0, 0.3]), 131), np.arange(3.0))
+    moved = unknown.after(TO_FILE)
+    path = written(tmp_path, scene.splats, moved)
+    entries = []
+    for view in scene.reconstruction.views:
+        camera = moved.apply_to_camera(view.camera)
+        pose = np.linalg.inv(camera.world_to_camera)
+        entries.append(
+            {
+                "img_name": view.name.removesuffix(".png"),
+                "width": camera.width,
+                "height": camera.height,
+                "fx": camera.fx,
+                "fy": camera.fy,
+                "rotation": pose[:3, :3].tolist(),
+                "position": pose[:3, 3].tolist(),
+            }
+        )
+    (path.parent / "cameras.json").write_text(json.dumps(entries))
+    deeper = path.parent / below / path.name
+    deeper.parent.mkdir(parents=True, exist_ok=True)
+    path.rename(deeper)
+    report = Report()
+    check_same(given_splats(deeper, scene.reconstruction, report), scene.splats)
+    assert report.metrics["given_world"] == "the world of cameras.json"
+
+
 def test_opensplats_centred_world_is_found(scene: SmallScene, tmp_path: Path) -> None:
     cameras = [TO_FILE.apply_to_camera(view.camera) for view in scene.reconstruction.views]
     centres = np.array([camera.centre for camera in cameras])

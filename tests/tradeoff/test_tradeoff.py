@@ -58,7 +58,7 @@ def inputs(scene):
     trained = TrainedSplats(splats)
 
     def prune_to(some, count):
-        asked = PruneSettings(max_splats=count, finetune_steps=10)
+        asked = PruneSettings(max_splats=count)
         return (
             pruner_of(asked, reconstruction, trained, training, "cpu", Report()).prune(some).splats
         )
