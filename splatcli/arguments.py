@@ -20,7 +20,10 @@ ENDINGS = ", ".join(f".{ending}" for ending in FORMATS)
 
 Photos = Annotated[
     Path | None,
-    typer.Argument(help="Folder of photographs; a run folder, or nothing, continues that run."),
+    typer.Argument(
+        help="Folder of photographs; a run folder, or nothing, continues that run, or with another "
+        "--out begins a second run as that one."
+    ),
 ]
 Run = Annotated[
     Path | None, typer.Argument(help="Run folder; by default the one in the current folder.")
