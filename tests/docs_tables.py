@@ -53,7 +53,7 @@ FORMAT_CELLS = (
     ),
     (
         ("v4.spz",),
-        "PlayCanvas, Open3D, three.js of August 2026 or newer: version 4",
+        "programs that read SPZ 4: tried with splat-transform, gsply and @adobe/spz",
         "as `spz`; written and read faster",
     ),
     (

@@ -30,7 +30,7 @@ class SeedSettings:
 
 STAGE = Stage(
     "seed",
-    version=9,
+    version=10,
     reads=("sfm",),
     settings_type=SeedSettings,
     **in_module("stages.seed.stage"),

@@ -7,9 +7,10 @@ an earlier run follows from the photographs that both runs have.
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from stages.base.text import counted
 from stages.cameras import inria
 from stages.raster.similarity import Similarity, rotation_to_up
 from stages.scene import Camera, Reconstruction, View
+from stages.sfm.known.match_cameras import name_parts
 
 NERFSTUDIO = "dataparser_transforms.json"  # beside the splats: how their world was normalised
 _FEWEST_POINTS = 4  # that have principal axes
@@ -68,7 +70,7 @@ def _of_cameras_beside(
     worlds = []
     for folder in (path.parent, *path.parents[2:3]):
         if file := inria.locate(folder):
-            pairs = _pairs(inria.read(file).views, reconstruction)
+            pairs = _pairs(inria.read(file).views, reconstruction, folders=False)
             if len(pairs) < _FEWEST_SHARED:
                 continue
             found = _between(pairs)
@@ -82,7 +84,7 @@ def world_of_run(earlier: Reconstruction, reconstruction: Reconstruction) -> Wor
 
     Raises SplatError "seed-splats-do-not-fit" where fewer than three have the same name in both.
     """
-    pairs = _pairs(earlier.views, reconstruction)
+    pairs = _pairs(earlier.views, reconstruction, folders=True)
     if len(pairs) < _FEWEST_SHARED:
         raise SplatError(
             "seed-splats-do-not-fit",
@@ -97,14 +99,19 @@ def world_of_run(earlier: Reconstruction, reconstruction: Reconstruction) -> Wor
     return World("the earlier run's world", replace(found, offset=offset))
 
 
-def _pairs(views: Sequence[View], reconstruction: Reconstruction) -> list[tuple[Camera, Camera]]:
-    """(camera elsewhere, camera in this run) of the photographs of one name, suffixes apart."""
-    cameras = {_stem(view.name): view.camera for view in reconstruction.views}
-    return [(v.camera, cameras[_stem(v.name)]) for v in views if _stem(v.name) in cameras]
+def _pairs(
+    views: Sequence[View], reconstruction: Reconstruction, folders: bool
+) -> list[tuple[Camera, Camera]]:
+    """(camera elsewhere, camera in this run) of the photographs of one name, suffixes apart.
+    folders: whether names there keep them; without, names that occur twice do not count."""
 
+    def by_name(views: Sequence[View]) -> dict[tuple[str, ...], Camera]:
+        keys = [tuple(name_parts(view.name)[: None if folders else 1]) for view in views]
+        counts = Counter(keys)
+        return {k: v.camera for k, v in zip(keys, views, strict=True) if counts[k] == 1}
 
-def _stem(name: str) -> str:
-    return str(PurePosixPath(name).with_suffix(""))
+    there, here = by_name(views), by_name(reconstruction.views)
+    return [(there[key], here[key]) for key in there if key in here]
 
 
 def _between(pairs: Sequence[tuple[Camera, Camera]]) -> Similarity:

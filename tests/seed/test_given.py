@@ -112,8 +112,10 @@ def test_nerfstudios_normalised_world_is_read_from_beside_the_splats(
 def test_the_world_of_a_cameras_json_beside_the_splats_is_read(
     scene: SmallScene, tmp_path: Path, below: str
 ) -> None:
-    """As gsplat's forks and OpenSplat write it, and two folders up as the reference trainer does;
-    names lack their suffix there."""
+    """As OpenSplat writes it, and two folders up as the reference trainer does; names lack their
+    folder and suffix there, and may have a dot."""
+    views = [replace(v, name=f"day/take.{v.name}") for v in scene.reconstruction.views]
+    scene = replace(scene, reconstruction=replace(scene.reconstruction, views=tuple(views)))
     unknown = Similarity(0.013, rotation_about(np.array([1.0, -2.0, 0.3]), 131), np.arange(3.0))
     moved = unknown.after(TO_FILE)
     path = written(tmp_path, scene.splats, moved)
@@ -123,7 +125,7 @@ def test_the_world_of_a_cameras_json_beside_the_splats_is_read(
         pose = np.linalg.inv(camera.world_to_camera)
         entries.append(
             {
-                "img_name": view.name.removesuffix(".png"),
+                "img_name": view.name.removeprefix("day/").removesuffix(".png"),
                 "width": camera.width,
                 "height": camera.height,
                 "fx": camera.fx,

@@ -59,12 +59,12 @@ def _matched(views: Sequence[View], photos: Sequence[Photo]) -> tuple[dict[int, 
     by_stem: dict[str, list[int]] = defaultdict(list)
     for position, photo in enumerate(photos):
         for name in {photo.name, photo.picture}:
-            by_stem[_parts(name)[0]].append(position)
+            by_stem[name_parts(name)[0]].append(position)
     matches: dict[int, int] = {}
     missing: list[str] = []
     owner: dict[int, str] = {}
     for number, view in enumerate(views):
-        candidates = set(by_stem.get(_parts(view.name)[0], ()))
+        candidates = set(by_stem.get(name_parts(view.name)[0], ()))
         scores = {i: _agreement(view.name, photos[i]) for i in candidates}
         best = [i for i in sorted(scores) if scores[i] == max(scores.values())]
         if not best:
@@ -79,7 +79,7 @@ def _matched(views: Sequence[View], photos: Sequence[Photo]) -> tuple[dict[int, 
     return matches, missing
 
 
-def _parts(name: str) -> list[str]:
+def name_parts(name: str) -> list[str]:
     """The name without its suffix, then its folders, innermost first; case-folded."""
     normalised = unicodedata.normalize("NFC", name.replace("\\", "/")).casefold()
     path = PurePosixPath(normalised)
@@ -93,7 +93,7 @@ def _suffix(name: str) -> str:
 
 def _agreement(name: str, photo: Photo) -> tuple[int, bool, bool]:
     """How well names agree, larger is better: (folders in common, same suffix, no more folders)."""
-    mine, theirs = _parts(name)[1:], _parts(photo.name)[1:]
+    mine, theirs = name_parts(name)[1:], name_parts(photo.name)[1:]
     common = 0
     for a, b in zip(mine, theirs, strict=False):
         if a != b:
