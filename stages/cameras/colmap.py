@@ -2,7 +2,8 @@
 
 Layout: https://colmap.github.io/format.html (binary files hold the same fields as the text files,
 little-endian). Records are written in order of id, so that equal models give equal bytes. Axes are
-the same as ours, and the world is not transformed.
+the same as ours, and the world is not transformed. The test photographs may be listed by name in
+test.txt beside these files, one a line, as the reference trainer reads it.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import itertools
 import os
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,7 @@ from stages.scene import Camera
 from stages.scene.rotations import matrices_of, quaternions_of
 
 _PINHOLE = 1
+_TEST = "test.txt"  # names of the test photographs
 
 
 @dataclass(frozen=True)
@@ -131,7 +133,7 @@ def locate(path: Path) -> Path | None:
 def files(folder: Path) -> list[Path]:
     """The files of the model that are read."""
     stems = ("cameras", "images", "points3D")
-    names = (f"{stem}.{kind}" for stem in stems for kind in ("bin", "txt"))
+    names = (*(f"{stem}.{kind}" for stem in stems for kind in ("bin", "txt")), _TEST)
     return [folder / name for name in names if (folder / name).is_file()]
 
 
@@ -203,4 +205,17 @@ def _read(folder: Path) -> tuple[CameraFile, list[ImageRecord]]:
         near = [base / "images" for base in (folder, folder.parent, folder.parent.parent)]
         pictures = next((path for path in near if path.is_dir()), near[0])
         names = [image.name for image in images]
-        return camera_file(pictures, names, own, matrices), images
+        found = camera_file(pictures, names, own, matrices)
+    return _with_roles(found, folder / _TEST), images
+
+
+def _with_roles(found: CameraFile, test: Path) -> CameraFile:
+    """The cameras with the roles that the list of test photographs gives them, if there is one.
+    Names without a camera are of photographs that were not registered."""
+    if not test.is_file():
+        return found
+    with reading(test, CAMERAS):
+        listed = {line.strip() for line in test.read_text(encoding="utf-8-sig").splitlines()}
+    roles = ["test" if view.name in listed else "train" for view in found.views]
+    views = [replace(view, role=role) for view, role in zip(found.views, roles, strict=True)]
+    return replace(found, views=tuple(views))

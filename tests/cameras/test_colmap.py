@@ -11,6 +11,7 @@ import pytest
 from stages.base.errors import SplatError
 from stages.cameras.camera_file import CameraFile
 from stages.cameras.colmap import (
+    files,
     locate,
     read,
     read_model,
@@ -50,6 +51,16 @@ def test_equal_models_give_equal_bytes(tmp_path: Path) -> None:
     example().write(tmp_path / "b")
     for name in ("cameras.bin", "images.bin", "points3D.bin"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+
+
+def test_photographs_that_a_model_lists_as_test_are_held_out(tmp_path: Path) -> None:
+    model = example()
+    model.write(tmp_path)
+    assert {view.role for view in read(tmp_path).views} == {""}
+    (tmp_path / "test.txt").write_text(f"{model.names[3]}\r\n\nnot_registered.jpg\n")
+    assert tmp_path / "test.txt" in files(tmp_path)
+    roles = {view.name: view.role for view in read(tmp_path).views}
+    assert roles == {name: "test" if name == model.names[3] else "train" for name in model.names}
 
 
 def test_a_model_without_points_is_still_a_model(tmp_path: Path) -> None:

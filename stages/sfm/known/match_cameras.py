@@ -176,7 +176,7 @@ def check_split(found: CameraFile, split: bool) -> None:
             "cameras-without-split",
             given="--split is given, but the camera file does not say which photographs are for "
             "training and which for testing.",
-            wanted="transforms_train.json and transforms_test.json, or a file with "
-            "train_filenames and test_filenames.",
+            wanted="transforms_train.json and transforms_test.json, a file with train_filenames "
+            "and test_filenames, or a COLMAP model with the test photographs' names in test.txt.",
             hint="Leave --split away; then every eighth photograph is held out.",
         )
