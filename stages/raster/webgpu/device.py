@@ -1,0 +1,294 @@
+"""The device of the WebGPU kernels: an adapter of wgpu, its buffers, and what is recorded for it.
+
+Dispatches are recorded in one compute pass and start with `submit`, or when a result is read. The
+numbers that a dispatch takes lie in one uniform buffer, 256 bytes apart, which is written before
+the submission. A dispatch sees what those before it wrote.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.base.errors import ResourceError
+from stages.base.text import size as size_text
+from stages.raster import definition
+from stages.raster.definition import MemoryFull
+
+try:
+    import wgpu
+except (ImportError, OSError, RuntimeError) as _error:  # not installed, or no library for it here
+    wgpu: Any = None  # type: ignore[no-redef]
+    _IMPORT_FAULT = f"wgpu cannot be imported ({_error})"
+
+FOLDER = Path(__file__).parent
+MOST_GROUPS = 65535  # in one dimension of a dispatch
+BYTES_A_SPLAT = 2200  # of training, degree 3: an estimate
+_SLOT, _SLOTS = 256, 512  # bytes for the numbers of a dispatch; dispatches in one submission
+_CONSTANTS = (
+    *("ALPHA_MIN", "ALPHA_MAX", "TRANSMITTANCE_MIN", "LOG_SCALE_MAX", "SCALE_MAX", "COLOUR_MAX"),
+    *("QUATERNION_MIN", "MEAN", "ROTATION", "LOG_SCALE", "OPACITY", "SH", "CONTRIBUTIONS"),
+)
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """An entry point of a file of WGSL.
+
+    file: where it is; a line "//include NAME" takes in another file of this folder. entry: the
+    function. constants: (name, number) pairs that stand before the source, beside those of
+    `definition`.
+    """
+
+    file: Path
+    entry: str
+    constants: tuple[tuple[str, float], ...] = ()
+
+    def source(self) -> str:
+        """The whole text."""
+        shared = [(name, getattr(definition, name)) for name in _CONSTANTS]
+        lines = [f"const {name} = {number!r};" for name, number in (*shared, *self.constants)]
+        text = self.file.read_text()
+        text = re.sub(r"^//include (\S+)$", lambda m: (FOLDER / m[1]).read_text(), text, flags=re.M)
+        return "\n".join([*lines, text])
+
+
+def why_unavailable() -> str:
+    """Why "auto" does not choose this backend on this machine; "" if it does."""
+    fault = missing()
+    if not fault and _adapter().info["adapter_type"] == "CPU":
+        return f"its adapter is a program on the CPU ({_adapter().info['device']})"
+    return fault
+
+
+@functools.cache
+def missing() -> str:
+    """Why the kernels cannot run here at all; "" if they can. Looked up once in a process."""
+    if wgpu is None:
+        return _IMPORT_FAULT
+    try:
+        _adapter()
+        device()
+    except Exception as error:  # a driver may fail in any way
+        return f"no adapter with WebGPU's limits: {(str(error).splitlines() or [''])[0]}"
+    return ""
+
+
+def describe() -> str:
+    """Adapter, driver and version of wgpu, in one line."""
+    require()
+    info = _adapter().info
+    name, driver = info["device"] or info["description"], info["description"]
+    return f"{name}, {info['backend_type']}, {driver}, wgpu {wgpu.__version__}"
+
+
+def require() -> Device:
+    """The device to run on. Raises SplatError if there is none."""
+    fault = missing()
+    if fault:
+        raise ResourceError(
+            "raster-no-webgpu",
+            given=f"The backend webgpu cannot run here: {fault}.",
+            wanted="It takes the package wgpu, and a driver for Vulkan, Metal or Direct3D 12.",
+            hint='Install it with pip install "splatcli[webgpu]", or choose --backend cpu.',
+        )
+    return device()
+
+
+@functools.cache
+def _adapter() -> Any:
+    return wgpu.gpu.request_adapter_sync(power_preference="high-performance")
+
+
+@functools.cache
+def device() -> Device:
+    """The device of this process."""
+    return Device(_adapter())
+
+
+class Device:
+    """A device of wgpu, and the dispatches that were recorded but not yet submitted.
+
+    largest: bytes that one buffer may hold.
+    """
+
+    def __init__(self, adapter: Any) -> None:
+        raised = ("max-storage-buffer-binding-size", "max-buffer-size")
+        limits = {name: adapter.limits[name] for name in raised}
+        self.wgpu = adapter.request_device_sync(required_limits=limits)
+        self.largest = min(limits.values())
+        usage = wgpu.BufferUsage.UNIFORM | wgpu.BufferUsage.COPY_DST
+        self._uniforms = self.wgpu.create_buffer(size=_SLOT * _SLOTS, usage=usage)
+        self._numbers, self._used = np.zeros((_SLOTS, _SLOT // 4), np.uint32), 0
+        self._encoder: Any = None
+        self._pass: Any = None
+
+    def empty(self, words: int) -> Any:
+        """A new buffer for so many numbers of 32 bits, at least one; zeros."""
+        usage = wgpu.BufferUsage
+        return self.wgpu.create_buffer(
+            size=4 * max(1, words), usage=usage.STORAGE | usage.COPY_SRC | usage.COPY_DST
+        )
+
+    def sent(self, array: NDArray[Any]) -> Any:
+        """A new buffer with the bytes of `array`, filled up to whole numbers of 32 bits."""
+        found = self.empty(-(-array.nbytes // 4))
+        self.send(array, found)
+        return found
+
+    def send(self, array: NDArray[Any], buffer: Any, offset: int = 0) -> None:
+        """Copy `array` into a buffer from byte `offset`, after all that is recorded."""
+        if array.nbytes:
+            data = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
+            if len(data) % 4:
+                data = np.concatenate([data, np.zeros(-len(data) % 4, np.uint8)])
+            self.submit()
+            self.wgpu.queue.write_buffer(buffer, offset, data)
+
+    def copy(self, source: Any, target: Any, words: int, offsets: tuple[int, int] = (0, 0)) -> None:
+        """Record a copy of so many numbers between buffers. offsets: of both, in numbers."""
+        if words:
+            first, second = offsets
+            self._outside().copy_buffer_to_buffer(source, 4 * first, target, 4 * second, 4 * words)
+
+    def clear(self, buffer: Any, words: int) -> None:
+        """Record that a buffer's first numbers become 0."""
+        if words:
+            self._outside().clear_buffer(buffer, 0, 4 * words)
+
+    def run(
+        self, kernel: Kernel, groups: int, buffers: Sequence[Any], numbers: Sequence[float] = ()
+    ) -> None:
+        """Record a dispatch of at least so many workgroups, in rows of MOST_GROUPS: kernels find
+        their own number with `group_of` and leave out those that are too many.
+
+        buffers: for bindings 1, 2, ... of group 0. numbers: for the uniform struct of binding 0,
+        32 bits each: a float of Python is a f32, another number a u32.
+        """
+        if groups <= 0:
+            return
+        if self._used == _SLOTS:
+            self.submit()
+        if self._pass is None:
+            self._pass = self._encoding().begin_compute_pass()
+        pipeline, layout = self._pipeline(kernel)
+        entries = [
+            {"binding": i, "resource": {"buffer": buffer}} for i, buffer in enumerate(buffers, 1)
+        ]
+        if numbers:
+            for k, number in enumerate(numbers):
+                bits = np.float32(number).view(np.uint32) if isinstance(number, float) else number
+                self._numbers[self._used, k] = bits
+            place = {"buffer": self._uniforms, "offset": _SLOT * self._used, "size": _SLOT}
+            entries.append({"binding": 0, "resource": place})
+            self._used += 1
+        self._pass.set_pipeline(pipeline)
+        self._pass.set_bind_group(0, self.wgpu.create_bind_group(layout=layout, entries=entries))
+        across = min(groups, MOST_GROUPS)
+        self._pass.dispatch_workgroups(across, -(-groups // across))
+
+    def submit(self) -> None:
+        """Let the device begin with what is recorded."""
+        if self._encoder is None:
+            return
+        encoder = self._outside()
+        if self._used:
+            self.wgpu.queue.write_buffer(self._uniforms, 0, self._numbers[: self._used])
+        self._encoder, self._used = None, 0
+        self.wgpu.queue.submit([encoder.finish()])
+
+    def read(self, buffer: Any, dtype: Any, count: int, offset: int = 0) -> NDArray[Any]:
+        """The first `count` numbers of a buffer, from number `offset`; waits for the device."""
+        return self.read_later(buffer, dtype, count, offset)()
+
+    def read_later(
+        self, buffer: Any, dtype: Any, count: int, offset: int = 0
+    ) -> Callable[[], NDArray[Any]]:
+        """Copies numbers, as they are after all that is recorded, to where the host can read them.
+        Returns a function, to be called once, that waits for them."""
+        if not count:
+            return lambda: np.zeros(0, dtype)
+        usage = wgpu.BufferUsage.COPY_DST | wgpu.BufferUsage.MAP_READ
+        landing = self.wgpu.create_buffer(size=4 * count, usage=usage)
+        self.copy(buffer, landing, count, (offset, 0))
+        self.submit()
+        promise = landing.map_async(wgpu.MapMode.READ)
+
+        def arrived() -> NDArray[Any]:
+            promise.sync_wait()
+            found = np.frombuffer(landing.read_mapped(), dtype).copy()
+            landing.destroy()
+            return found
+
+        return arrived
+
+    def _encoding(self) -> Any:
+        if self._encoder is None:
+            self._encoder = self.wgpu.create_command_encoder()
+        return self._encoder
+
+    def _outside(self) -> Any:
+        """The encoder, outside of a compute pass."""
+        if self._pass is not None:
+            self._pass.end()
+            self._pass = None
+        return self._encoding()
+
+    @functools.cache  # noqa: B019 - a device lives as long as the process
+    def _pipeline(self, kernel: Kernel) -> tuple[Any, Any]:
+        module = _module(self, kernel.source())
+        stage = {"module": module, "entry_point": kernel.entry}
+        made = self.wgpu.create_compute_pipeline(layout="auto", compute=stage)
+        return made, made.get_bind_group_layout(0)
+
+
+@functools.cache
+def _module(device: Device, source: str) -> Any:
+    return device.wgpu.create_shader_module(code=source)
+
+
+class Buffers:
+    """Buffers by name that only grow: a step allocates nothing, and a buffer keeps what it held."""
+
+    def __init__(self, device: Device) -> None:
+        self.device = device
+        self._buffers: dict[str, Any] = {}
+
+    def get(self, name: str, words: int) -> Any:
+        """A buffer for at least so many numbers of 32 bits; valid until more are asked for."""
+        have = self._buffers.get(name)
+        if have is None or have.size < 4 * words:
+            self._buffers.pop(name, None)
+            room = min(words + words // 8, max(words, self.device.largest // 4))
+            have = self._buffers[name] = self.device.empty(room)
+        return have
+
+
+@contextmanager
+def errors_explained(splats: int) -> Iterator[None]:
+    """Turn errors of the device, while it works on so many splats, into SplatError."""
+    try:
+        yield
+    except wgpu.GPUOutOfMemoryError as error:
+        raise MemoryFull(splats, splats // 2, "the device refused a buffer") from error
+    except wgpu.GPUValidationError as error:
+        most = device().largest
+        if not re.search("[Bb]uffer (size|binding)", str(error)):
+            raise
+        fits = min(splats // 2, int(0.9 * most / 256))
+        raise MemoryFull(splats, fits, f"one buffer holds {size_text(most)}") from error
+    except wgpu.GPUError as error:
+        raise ResourceError(
+            "raster-webgpu-failed",
+            given=f"The GPU stopped: {(str(error).splitlines() or [''])[0]}.",
+            wanted="A GPU that answers.",
+            hint="Run `splat doctor`, close other programs on the card, or choose --backend cpu.",
+        ) from error
