@@ -105,7 +105,7 @@ def require() -> Device:
 
 @functools.cache
 def _adapter() -> Any:
-    return wgpu.gpu.request_adapter_sync(power_preference="high-performance")
+    return wgpu.gpu.request_adapter_sync(power_preference=wgpu.PowerPreference.high_performance)
 
 
 @functools.cache
@@ -121,8 +121,8 @@ class Device:
     """
 
     def __init__(self, adapter: Any) -> None:
-        raised = ("max-storage-buffer-binding-size", "max-buffer-size")
-        limits = {name: adapter.limits[name] for name in raised}
+        raised = ("max_storage_buffer_binding_size", "max_buffer_size")
+        limits = {name: adapter.limits[name.replace("_", "-")] for name in raised}
         self.wgpu = adapter.request_device_sync(required_limits=limits)
         self.largest = min(limits.values())
         usage = wgpu.BufferUsage.UNIFORM | wgpu.BufferUsage.COPY_DST
