@@ -23,6 +23,7 @@ SHARED_OPTIONS = {
     "allow_partial": ("sfm", "prune"),  # use what failed a check
     "max_splats": ("train",),  # what `prune` is given by itself is a target, whatever the loss
     "splats": ("seed", "train"),  # brought into the run's world, and trained from
+    "densify": ("seed", "train"),  # first splats where given ones leave holes, and splits
     "seconds": ("train", "prune"),  # divided among them, see `pipeline.within_limit`
     "formats": ("quantise", "export"),  # what is fine-tuned to, and what is written
     "drawing": ("train", "quantise", "export"),  # trained for, fine-tuned for, and written for it

@@ -26,6 +26,12 @@ class SeedSettings:
         affects_output=False,  # its content does, and that is an input
     )
     fill: bool = setting(True, "Add splats where photographs show surfaces without points.")
+    densify: bool = setting(
+        False,
+        "Add first splats to --splats where these leave photographs uncovered.",
+        panel="Known cameras",
+        needs="splats",
+    )
 
 
 STAGE = Stage(

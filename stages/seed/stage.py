@@ -1,5 +1,5 @@
 """Stage 3: Reconstruction -> Splats: initial splats at sparse points, and where there are none, or
-the `given` ones of another program.
+the `given` ones of another program, with first splats where these leave pictures `uncovered`.
 
 Follows the reference trainer (Kerbl et al., 3D Gaussian Splatting, 2023, section 5.1): one round
 splat a point, as large as the mean distance to its three nearest neighbours, opacity 0.1. Its axes
@@ -10,6 +10,7 @@ measured depth and filled cells are added.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from stages.base.errors import ReconstructionError, SplatError
 from stages.base.stage import Report
+from stages.formats.values import concatenate
 from stages.scene import (
     Reconstruction,
     Splats,
@@ -36,6 +38,7 @@ from stages.seed.measured_depth import measured_points
 from stages.seed.neighbours import mean_neighbour_distance, nearest_distance
 from stages.seed.plane_sweep import plane_sweep_points
 from stages.seed.settings import SeedSettings
+from stages.seed.uncovered import uncovered
 from stages.seed.view_selection import selected_views
 
 OPACITY = 0.1
@@ -58,6 +61,8 @@ def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report:
     reconstruction: Reconstruction = inputs["sfm"]
     if settings.splats is not None:
         splats = given_splats(settings.splats, reconstruction, report)
+        if settings.densify:
+            splats = _with_first_splats(splats, reconstruction, settings, report)
     else:
         splats = _initial(reconstruction, settings, report)
     save_splats(folder, splats)
@@ -68,6 +73,20 @@ def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report:
 def load(folder: Path) -> Splats:
     """The splats of a finished folder."""
     return load_splats(folder)
+
+
+def _with_first_splats(
+    given: Splats, reconstruction: Reconstruction, settings: SeedSettings, report: Report
+) -> Splats:
+    """The given splats, and first ones where these leave the photographs uncovered."""
+    try:
+        first = _initial(reconstruction, settings, report)
+    except ReconstructionError:  # too few points, which given splats do not need
+        return given
+    training, _ = split_held_out(reconstruction.views)
+    first = first[uncovered(given, first.means.astype(np.float64), training)]
+    report.metric("added_to_given", len(first))
+    return replace(concatenate([given, first]), origin=given.origin)
 
 
 def _initial(reconstruction: Reconstruction, settings: SeedSettings, report: Report) -> Splats:

@@ -302,3 +302,37 @@ def test_an_earlier_run_of_other_photographs_is_refused(scene: SmallScene, tmp_p
         given_splats(path, replace(scene.reconstruction, views=tuple(renamed)), Report())
     assert caught.value.code == "seed-splats-do-not-fit"
     assert "2 photographs" in caught.value.given
+
+
+def test_first_splats_are_added_only_where_given_ones_leave_photographs_uncovered(
+    scene: SmallScene, tmp_path: Path
+) -> None:
+    """The lower end of the scene is missing. Points are in its middle and at that end."""
+    kept = scene.splats[scene.splats.means[:, 1] < 0.3]
+    path = written(tmp_path, kept, TO_FILE)
+    rng = np.random.default_rng(5)
+    middle = rng.uniform((-0.2, -0.3, -0.2), (0.2, 0.1, 0.2), (200, 3))
+    below = rng.uniform((-0.2, 0.9, -0.2), (0.2, 1.1, 0.2), (200, 3))
+    world = replace(
+        scene.reconstruction,
+        points=np.concatenate([middle, below]),
+        colours=np.full((400, 3), 90, np.uint8),
+        errors_px=np.zeros(400),
+        tracks=np.full(400, 3, np.int32),
+    )
+    settings = SeedSettings(splats=path, fill=False)
+    assert len(stage.run({"sfm": world}, settings, tmp_path, Report())) == len(kept)
+    report = Report()
+    found = stage.run({"sfm": world}, replace(settings, densify=True), tmp_path, report)
+    check_same(found[: len(kept)], kept)
+    np.testing.assert_array_equal(found.origin, world.origin)
+    added = found.means[len(kept) :]
+    assert len(added) == report.metrics["added_to_given"] >= 150
+    assert (added[:, 1] > 0.5).all()
+
+
+def test_given_splats_need_no_points_to_be_densified(scene: SmallScene, tmp_path: Path) -> None:
+    path = written(tmp_path, scene.splats, TO_FILE)
+    settings = SeedSettings(splats=path, fill=False, densify=True)
+    world = replace(scene.reconstruction, points=np.zeros((0, 3)))
+    assert len(stage.run({"sfm": world}, settings, tmp_path, Report())) == len(scene.splats)
