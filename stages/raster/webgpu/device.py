@@ -54,11 +54,21 @@ class Kernel:
 
     def source(self) -> str:
         """The whole text."""
-        shared = [(name, getattr(definition, name)) for name in _CONSTANTS]
+        shared = [(name, _within(name, getattr(definition, name))) for name in _CONSTANTS]
         lines = [f"const {name} = {number!r};" for name, number in (*shared, *self.constants)]
         text = self.file.read_text()
         text = re.sub(r"^//include (\S+)$", lambda m: (FOLDER / m[1]).read_text(), text, flags=re.M)
         return "\n".join([*lines, text])
+
+
+def _within(name: str, bound: float) -> float:
+    """A number that float32 holds, not beyond a bound that float32 may not hold."""
+    if not isinstance(bound, float):
+        return bound
+    found, largest = np.float32(bound), name.endswith("_MAX")
+    if float(found) > bound if largest else float(found) < bound:
+        found = np.nextafter(found, np.float32(0 if largest else np.inf))
+    return float(found)
 
 
 def why_unavailable() -> str:
