@@ -8,6 +8,7 @@ the submission. A dispatch sees what those before it wrote.
 from __future__ import annotations
 
 import functools
+import importlib.util
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -115,6 +116,9 @@ def require() -> Device:
 
 @functools.cache
 def _adapter() -> Any:
+    if importlib.util.find_spec("triton"):
+        # loaded after the LLVM of Mesa's drivers, Triton's crashes; the other order works
+        importlib.import_module("triton")
     return wgpu.gpu.request_adapter_sync(power_preference=wgpu.PowerPreference.high_performance)
 
 
@@ -180,8 +184,9 @@ class Device:
         """Record a dispatch of at least so many workgroups, in rows of MOST_GROUPS: kernels find
         their own number with `group_of` and leave out those that are too many.
 
-        buffers: for bindings 1, 2, ... of group 0. numbers: for the uniform struct of binding 0,
-        32 bits each: a float of Python is a f32, another number a u32.
+        buffers: for bindings 1, 2, ... of group 0; None where the kernel has none. numbers: for the
+        uniform struct of binding 0, 32 bits each: a float of Python is a f32, another number a
+        u32.
         """
         if groups <= 0:
             return
@@ -191,7 +196,9 @@ class Device:
             self._pass = self._encoding().begin_compute_pass()
         pipeline, layout = self._pipeline(kernel)
         entries = [
-            {"binding": i, "resource": {"buffer": buffer}} for i, buffer in enumerate(buffers, 1)
+            {"binding": i, "resource": {"buffer": buffer}}
+            for i, buffer in enumerate(buffers, 1)
+            if buffer is not None
         ]
         if numbers:
             for k, number in enumerate(numbers):
@@ -273,7 +280,7 @@ class Buffers:
         self._buffers: dict[str, Any] = {}
 
     def get(self, name: str, words: int) -> Any:
-        """A buffer for at least so many numbers of 32 bits; valid until more are asked for."""
+        """A buffer for at least so many numbers of 32 bits; valid until the next call."""
         have = self._buffers.get(name)
         if have is None or have.size < 4 * words:
             self._buffers.pop(name, None)

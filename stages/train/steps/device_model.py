@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
@@ -17,11 +17,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from stages.raster.definition import LOG_SCALE, MEAN, OPACITY, ROTATION, SH
-from stages.raster.gpu.rasteriser import DeviceScene, GpuRasteriser
 from stages.raster.smoothing import RIM, VARIANCE
 from stages.scene import Camera, morton
 from stages.train.free_space import ENOUGH_VIEWS_PAST, FAR, MIN_VIEWS_PAST, NEAR, FreeSpace
 from stages.train.optimiser import LEAST_DISTANCE, Model
+
+if TYPE_CHECKING:
+    from stages.raster.gpu.rasteriser import DeviceScene, GpuRasteriser  # loads Triton
 
 FIELDS = tuple(field.name for field in fields(Model))
 PLACES: dict[str, slice | int] = {
@@ -36,31 +38,84 @@ NEW = {"distances": 1} | dict.fromkeys(
 )
 
 
+class Held(Protocol):
+    """A model's numbers on a device. device: of the tensors that `column` gives."""
+
+    @property
+    def device(self) -> torch.device: ...
+    @property
+    def coefficients(self) -> int: ...
+    def __len__(self) -> int: ...
+
+    def column(self, name: str) -> Tensor:
+        """A field of `Model`, not to be written to; SH coefficients are [N, 3 coefficients]."""
+
+    def finite(self) -> Tensor:
+        """[N] bool: see `Model.finite`."""
+
+    def gathered(self, model: DeviceModel) -> Held:
+        """The numbers of the model's rows alone."""
+
+    def on_host(self) -> Held:
+        """One whose columns are on the host."""
+
+
 @dataclass
-class Held:
-    """A model's tensors. scene: the parameters; others: the remaining fields of `Model`, by
-    name."""
+class TensorsHeld:
+    """See `Held`. scene: the parameters; others: the remaining fields of `Model`, by name."""
 
     scene: DeviceScene
     others: dict[str, Tensor]
 
+    def __len__(self) -> int:
+        return len(self.scene)
+
+    @property
+    def device(self) -> torch.device:
+        """See `Held`."""
+        return self.scene.rows.device
+
+    @property
+    def coefficients(self) -> int:
+        """See `Held`."""
+        return self.scene.coefficients
+
     def column(self, name: str) -> Tensor:
-        """A field of `Model`; parameters are views of the rows."""
+        """See `Held`; parameters are views of the rows."""
         if name in self.others:
             return self.others[name]
         rows, used = self.scene.rows, self.scene.layout[1]
         return rows[:, SH:used] if name == "sh" else rows[:, PLACES[name]]
+
+    def finite(self) -> Tensor:
+        """See `Held`."""
+        return self.scene.rows.isfinite().all(1)
+
+    def gathered(self, model: DeviceModel) -> TensorsHeld:
+        """See `Held`."""
+        rows = self.scene.rows
+        rows = rows.clone() if model.index is None else rows[model.index]
+        for name, place in PLACES.items():
+            if name in model.given:
+                rows[:, place] = model.given[name]
+        others = {name: model.column(name) for name in self.others}
+        return TensorsHeld(replace(self.scene, rows=rows), others)
+
+    def on_host(self) -> TensorsHeld:
+        """See `Held`."""
+        scene = replace(self.scene, rows=self.scene.rows.cpu())
+        return TensorsHeld(scene, {name: tensor.cpu() for name, tensor in self.others.items()})
 
     def release(self) -> None:
         """Free the memory, whoever still has this."""
         self.scene, self.others = replace(self.scene, rows=self.scene.rows[:0].clone()), {}
 
 
-def held_of(model: Model, rasteriser: GpuRasteriser) -> Held:
+def held_of(model: Model, rasteriser: GpuRasteriser) -> TensorsHeld:
     """A model on the host, sent to the rasteriser's device."""
     arrays = {name: vars(model)[name] for name in FIELDS[len(model.arrays) :]}
     others = {name: torch.tensor(array, device=rasteriser.device) for name, array in arrays.items()}
-    return Held(rasteriser.scene(model.arrays), others)
+    return TensorsHeld(rasteriser.scene(model.arrays), others)
 
 
 class DeviceModel(Model):
@@ -73,10 +128,10 @@ class DeviceModel(Model):
         given: columns [N, ...] in place of those held, by name.
     """
 
-    _held: Held
-    _index: Tensor | None
-    _new: Tensor | None
-    _given: dict[str, Tensor]
+    held: Held
+    index: Tensor | None
+    new: Tensor | None
+    given: dict[str, Tensor]
 
     def __init__(
         self,
@@ -85,10 +140,10 @@ class DeviceModel(Model):
         new: Tensor | None = None,
         given: dict[str, Tensor] | None = None,
     ) -> None:
-        vars(self).update(_held=held, _index=index, _new=new, _given=given or {})
+        vars(self).update(held=held, index=index, new=new, given=given or {})
 
     def __len__(self) -> int:
-        return len(self._held.scene if self._index is None else self._index)
+        return len(self.held if self.index is None else self.index)
 
     def __getattr__(self, name: str) -> Any:
         """A copy of a field on the host, which cannot be written to."""
@@ -100,87 +155,72 @@ class DeviceModel(Model):
         return found
 
     def __setattr__(self, name: str, value: Any) -> None:
-        self._given[name] = torch.as_tensor(value, device=self._device)
+        self.given[name] = torch.as_tensor(value, device=self.held.device)
         vars(self).pop(name, None)
-
-    @property
-    def _device(self) -> torch.device:
-        return self._held.scene.rows.device
 
     def _on_host(self, name: str) -> NDArray[Any]:
         found = self.column(name)
         if name == "sh":
-            found = found.reshape(len(self), self._held.scene.coefficients, 3)
+            found = found.reshape(len(self), self.held.coefficients, 3)
         host: NDArray[Any] = found.to("cpu", copy=True).contiguous().numpy()
         return host
 
     def column(self, name: str) -> Tensor:
         """A field on the device."""
-        if name in self._given:
-            return self._given[name]
-        found = self._held.column(name)
-        if self._index is not None:
-            found = found[self._index]
-        if self._new is not None and name in NEW:
+        if name in self.given:
+            return self.given[name]
+        found = self.held.column(name)
+        if self.index is not None:
+            found = found[self.index]
+        if self.new is not None and name in NEW:
             found = found.clone()
-            found[self._new] = NEW[name]
+            found[self.new] = NEW[name]
         return found
 
     def gathered(self) -> Held:
-        """The tensors of these rows alone; those held if these are the rows."""
-        if self._index is None and not self._given:
-            return self._held
-        scene, rows = self._held.scene, self._held.scene.rows
-        rows = rows.clone() if self._index is None else rows[self._index]
-        for name, place in PLACES.items():
-            if name in self._given:
-                rows[:, place] = self._given[name]
-        return Held(
-            replace(scene, rows=rows), {name: self.column(name) for name in self._held.others}
-        )
+        """The numbers of these rows alone; those held if these are the rows."""
+        return self.held if self.index is None and not self.given else self.held.gathered(self)
 
     def on_host(self) -> Model:
         """See `Model.on_host`. Needs no memory of the device: rows are gathered on the host."""
-        scene = replace(self._held.scene, rows=self._held.scene.rows.cpu())
-        others = {name: tensor.cpu() for name, tensor in self._held.others.items()}
-        index, new = (None if t is None else t.cpu() for t in (self._index, self._new))
-        given = {name: column.cpu() for name, column in self._given.items()}
-        there = DeviceModel(Held(scene, others), index, new, given)
+        index, new = (None if t is None else t.cpu() for t in (self.index, self.new))
+        given = {name: column.cpu() for name, column in self.given.items()}
+        there = DeviceModel(self.held.on_host(), index, new, given)
         return Model(*(there._on_host(name) for name in FIELDS))
 
     def take(self, index: NDArray[np.integer] | NDArray[np.bool_]) -> Model:
         """See `Model.take`."""
         rows = np.flatnonzero(index) if index.dtype == bool else index
-        return self._taken(torch.as_tensor(rows, dtype=torch.int64, device=self._device))
+        return self._taken(torch.as_tensor(rows, dtype=torch.int64, device=self.held.device))
 
     def _taken(self, rows: Tensor) -> DeviceModel:
-        index = rows if self._index is None else self._index[rows]
-        new = None if self._new is None else self._new[rows]
-        given = {name: column[rows] for name, column in self._given.items()}
-        return DeviceModel(self._held, index, new, given)
+        index = rows if self.index is None else self.index[rows]
+        new = None if self.new is None else self.new[rows]
+        given = {name: column[rows] for name, column in self.given.items()}
+        return DeviceModel(self.held, index, new, given)
 
     def joined(self, other: Model) -> Model:
         """See `Model.joined`; of two models of the same step."""
         assert isinstance(other, DeviceModel)
-        assert other._held is self._held
-        both, device = (self, other), self._device
+        assert other.held is self.held
+        both, device = (self, other), self.held.device
         index = torch.cat([m._every() for m in both])
         none = [torch.zeros(len(m), dtype=torch.bool, device=device) for m in both]
-        new = torch.cat([n if m._new is None else m._new for m, n in zip(both, none, strict=True)])
-        names = self._given.keys() | other._given.keys()
+        new = torch.cat([n if m.new is None else m.new for m, n in zip(both, none, strict=True)])
+        names = self.given.keys() | other.given.keys()
         given = {name: torch.cat([m.column(name) for m in both]) for name in names}
-        return DeviceModel(self._held, index, new, given)
+        return DeviceModel(self.held, index, new, given)
 
     def _every(self) -> Tensor:
         """[N] numbers of rows."""
-        every = torch.arange(len(self._held.scene), device=self._device)
-        return every if self._index is None else self._index
+        every = torch.arange(len(self.held), device=self.held.device)
+        return every if self.index is None else self.index
 
     def fresh(self) -> Model:
         """See `Model.fresh`."""
-        new = torch.ones(len(self), dtype=torch.bool, device=self._device)
-        given = {name: column for name, column in self._given.items() if name not in NEW}
-        return DeviceModel(self._held, self._every(), new, given)
+        new = torch.ones(len(self), dtype=torch.bool, device=self.held.device)
+        given = {name: column for name, column in self.given.items() if name not in NEW}
+        return DeviceModel(self.held, self._every(), new, given)
 
     def reset_gradients(self) -> None:
         """See `Model.reset_gradients`."""
@@ -189,10 +229,10 @@ class DeviceModel(Model):
 
     def finite(self) -> NDArray[np.bool_]:
         """See `Model.finite`."""
-        good = self._held.scene.rows.isfinite().all(1)
-        good = good if self._index is None else good[self._index]
-        for name in self._given.keys() & PLACES.keys():
-            good = good & self._given[name].reshape(len(self), -1).isfinite().all(1)
+        good = self.held.finite()
+        good = good if self.index is None else good[self.index]
+        for name in self.given.keys() & PLACES.keys():
+            good = good & self.given[name].reshape(len(self), -1).isfinite().all(1)
         return np.asarray(good.cpu().numpy())
 
     def in_morton_order(self) -> Model:
@@ -204,7 +244,7 @@ class DeviceModel(Model):
         means = self.column("means").double()
         found = torch.full_like(means[:, 0], torch.inf)
         for camera in cameras:
-            centre = torch.tensor(camera.centre, device=self._device)
+            centre = torch.tensor(camera.centre, device=self.held.device)
             found = torch.minimum(found, (means - centre).square().sum(1))
         found = torch.where(found.isfinite(), found.sqrt() / extent, 1.0)
         return found.clamp(min=LEAST_DISTANCE).float()
@@ -226,12 +266,12 @@ class DeviceModel(Model):
     def in_free_space(self, space: FreeSpace) -> NDArray[np.bool_]:
         """See `Model.in_free_space`."""
         means = self.column("means").double()
-        past = torch.zeros(len(means), dtype=torch.int32, device=self._device)
+        past = torch.zeros(len(means), dtype=torch.int32, device=self.held.device)
         for camera, depths in zip(space.cameras, space.depths, strict=True):
             x, y, z = projected(camera, means)
             seen = (z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
             column, row = (torch.where(seen, c, 0.0).long() for c in (x, y))
-            relative = z / torch.tensor(depths, device=self._device)[row, column]
+            relative = z / torch.tensor(depths, device=self.held.device)[row, column]
             in_front, seen = relative < NEAR, seen & (relative > 0)
             past += (seen & in_front).int()
             past += ENOUGH_VIEWS_PAST * (seen & ~in_front & (relative <= FAR)).int()

@@ -39,7 +39,7 @@ from stages.train.optimiser import (
     empty_model,
 )
 from stages.train.steps import gpu_kernels
-from stages.train.steps.device_model import DeviceModel, held_of
+from stages.train.steps.device_model import DeviceModel, TensorsHeld, held_of
 from stages.train.steps.step import StepInput
 from stages.train.views import Colour, Level, evened
 
@@ -172,7 +172,9 @@ class GpuStep:
     def _load(self, model: Model) -> None:
         if isinstance(model, DeviceModel):
             try:
-                self._held, self._on_host = model.gathered(), None
+                held, self._on_host = model.gathered(), None
+                assert isinstance(held, TensorsHeld)
+                self._held = held
             except torch.OutOfMemoryError:
                 if self._targets:
                     raise
