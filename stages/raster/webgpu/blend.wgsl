@@ -86,7 +86,7 @@ fn alphas(row: u32, f: Frame, p: Pixels) -> vec4<f32> {
 @group(0) @binding(5) var<storage, read_write> transmittance: array<f32>;
 @group(0) @binding(6) var<storage, read_write> last: array<u32>;
 
-// image [4 or 6, H, W]: colour, alpha, and if asked for expected and median depth. transmittance
+// image [4 or 6, H, W]: colour, alpha, and with `depths` expected and median depth. transmittance
 // [H, W]: what is left. last [H, W]: the number of the last entry drawn, or NEVER.
 @compute @workgroup_size(LANES)
 fn blend(here: Place) {
@@ -160,6 +160,11 @@ fn put_sum(k: u32, column: u32, lane: u32, values: vec4<f32>) {
     put(k, column, lane, (values.x + values.y) + (values.z + values.w));
 }
 
+// Each lane begins with another, so that they do not wait for the same bank of memory.
+fn part(lane: u32, i: u32) -> f32 {
+    return parts[lane * LANES + i % LANES];
+}
+
 // Adds up what the lanes have put, or takes the largest in column `largest`, and writes it to the
 // slots of the `count` entries that end with number `end`, last first.
 fn write_sums(start: u32, end: u32, count: u32, lane: u32, largest: u32) {
@@ -167,13 +172,14 @@ fn write_sums(start: u32, end: u32, count: u32, lane: u32, largest: u32) {
     let k = lane / SUMS;
     let column = lane % SUMS;
     if (k < count) {
-        var total = 0.0;
-        for (var i = 0u; i < LANES; i++) {
-            // each lane begins elsewhere, so that they do not wait for the same bank of memory
-            let value = parts[lane * LANES + (i + lane) % LANES];
-            total = select(total + value, max(total, value), column == largest);
+        var four = vec4(0.0);
+        for (var i = lane; i < lane + LANES; i += 4) {
+            let next = vec4(part(lane, i), part(lane, i + 1), part(lane, i + 2), part(lane, i + 3));
+            four = select(four + next, max(four, next), column == largest);
         }
-        out[slots[start + end - 1 - k] * SUMS + column] = total;
+        let sum = (four.x + four.y) + (four.z + four.w);
+        let top = max(max(four.x, four.y), max(four.z, four.w));
+        out[slots[start + end - 1 - k] * SUMS + column] = select(sum, top, column == largest);
     }
     workgroupBarrier();
 }
@@ -181,6 +187,10 @@ fn write_sums(start: u32, end: u32, count: u32, lane: u32, largest: u32) {
 // The number of the tile's entries that reach any pixel, the same for all lanes.
 fn reached(tile: u32, lane: u32, finished_at: vec4<u32>) -> u32 {
     let most = max(max(finished_at.x, finished_at.y), max(finished_at.z, finished_at.w));
+    if (lane == 0) {
+        atomicStore(&furthest, 0u); // not every implementation begins with zeros
+    }
+    workgroupBarrier();
     atomicMax(&furthest, most);
     workgroupBarrier();
     return min(atomicLoad(&furthest), starts[tile + 1] - starts[tile]);
