@@ -131,8 +131,9 @@ def _gpu() -> str:
 
 def _meaning() -> str:
     """Where training happens, and how long it takes there."""
-    if backend_of(AUTO).name != "cpu":
-        return f"uses {backend_of(AUTO).name} ({device.describe()})"
+    chosen = backend_of(AUTO)
+    if chosen.name != "cpu":
+        return f"uses {chosen.name} ({chosen.describe()})"
     slower = 1.0 if _has_avx512() else _WITHOUT_AVX512
     takes = (
         f"about {max(1, round(slower * minutes / threads.count()))} min at `{preset}`"

@@ -66,6 +66,24 @@ def _gpu_description() -> str:
     return device.describe()
 
 
+def _webgpu() -> Rasteriser:
+    from stages.raster.webgpu.rasteriser import WebGpuRasteriser  # loads wgpu, the list does not
+
+    return WebGpuRasteriser()
+
+
+def _why_no_webgpu() -> str:
+    from stages.raster.webgpu import device  # loads wgpu, the list does not
+
+    return device.why_unavailable()
+
+
+def _webgpu_description() -> str:
+    from stages.raster.webgpu import device  # loads wgpu, the list does not
+
+    return device.describe()
+
+
 def _cpu() -> Rasteriser:
     from stages.raster.cpu.rasteriser import CpuRasteriser  # loads torch, the list does not
 
@@ -82,6 +100,10 @@ def _reference() -> Rasteriser:
 # "auto" takes the first that is available.
 BACKENDS = (
     Backend("gpu", _gpu, "Triton kernels", _why_no_gpu, _gpu_description, needs_hardware=True),
+    Backend(
+        *("webgpu", _webgpu, "Vulkan, Metal or Direct3D", _why_no_webgpu, _webgpu_description),
+        needs_hardware=True,
+    ),
     Backend("cpu", _cpu, "compiled kernels"),
     Backend("reference", _reference, "torch, slow"),
 )

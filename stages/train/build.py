@@ -136,7 +136,7 @@ def _limited_steps(settings: TrainSettings, views: int, report: Report) -> int:
 
 def _on_the_host(backend: str, report: Report) -> str:
     """The backend, or the CPU's instead of a GPU's, whose steps do not give out their gradients."""
-    if backend_of(backend).name != "gpu":
+    if not backend_of(backend).needs_hardware:
         return backend
     report.warn(
         "train-refinement-on-cpu",

@@ -356,7 +356,7 @@ def test_a_missing_run_folder_is_reported_with_the_first_command(splat) -> None:
         (["process", "photos", "--steps", "-4"], "--steps -4 cannot be used"),
         (["process", "photos", "--steps", "many"], "A whole number from 0 to 1,000,000."),
         (["process", "photos", "--preset", "fast"], "One of preview, standard, best."),
-        (["process", "photos", "--backend", "cuda"], "One of auto, gpu, cpu, reference."),
+        (["process", "photos", "--backend", "cuda"], "One of auto, gpu, webgpu, cpu, reference."),
         (["process", "photos", "--format", "obj"], "--format obj cannot be used"),
         (["process", "photos", "--stepz", "4"], "splat process: No such option: --stepz"),
         (["process", "photos", "--steps"], "--steps"),

@@ -146,10 +146,10 @@ class Device:
         self._pass: Any = None
 
     def empty(self, words: int) -> Any:
-        """A new buffer for so many numbers of 32 bits, at least one; zeros."""
+        """A new buffer for so many numbers of 32 bits, at least four (a vector); zeros."""
         usage = wgpu.BufferUsage
         return self.wgpu.create_buffer(
-            size=4 * max(1, words), usage=usage.STORAGE | usage.COPY_SRC | usage.COPY_DST
+            size=4 * max(4, words), usage=usage.STORAGE | usage.COPY_SRC | usage.COPY_DST
         )
 
     def sent(self, array: NDArray[Any]) -> Any:

@@ -20,6 +20,7 @@ from stages.train.views import Level
 # A backend with training kernels of its own keeps parameters and moments where these are.
 _OWN_STEPS = {
     "gpu": "stages.train.steps.gpu:GpuStep",
+    "webgpu": "stages.train.steps.webgpu:WebGpuStep",
     "cpu": "stages.train.steps.cpu:CpuStep",
 }
 _OTHER_BACKENDS = "stages.train.steps.reference:ReferenceStep"

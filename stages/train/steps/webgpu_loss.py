@@ -36,11 +36,11 @@ def photograph_of(level: Level, device: Device) -> Any:
 
 class Loss:
     """The loss against a view and its gradient. sums: a buffer of three means of the target's
-    channels, that of SSIM, that of |difference|."""
+    channels, that of SSIM, that of |difference|, and a number for whoever reads it."""
 
     def __init__(self, buffers: Buffers) -> None:
         self.buffers, self.device = buffers, buffers.device
-        self.sums = self.device.empty(5)
+        self.sums = self.device.empty(6)
 
     def gradient(
         self, image: Any, photograph: Any, level: Level, background: Colour, weight: float = 1.0

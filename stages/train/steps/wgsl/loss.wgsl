@@ -60,9 +60,9 @@ fn place(here: vec3u, k: u32) -> i32 {
 
 // out [3, H, W]: the target of the picture. parts [3, groups]: its sums.
 @compute @workgroup_size(256)
-fn target_of(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u,
-             @builtin(local_invocation_index) lane: u32) {
-    let number = group_of(group, groups);
+fn target_of(at_work: Place) {
+    let lane = at_work.lane;
+    let number = group_of(at_work);
     let pixels = p.width * p.height;
     let at = number * 256u + lane;
     let inside = at < pixels;
@@ -82,19 +82,20 @@ fn target_of(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) group
 
 // sums[first + k] = factor x the sum of row k of `addends` [rows, count]. One group a row.
 @compute @workgroup_size(256)
-fn sum_rows(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+fn sum_rows(at_work: Place) {
+    let lane = at_work.lane;
+    let row = group_of(at_work);
     var total = 0.0;
-    for (var k = lane; k < rows.count; k += 256u) { total += addends[group.x * rows.count + k]; }
+    for (var k = lane; k < rows.count; k += 256u) { total += addends[row * rows.count + k]; }
     let sum = group_sum(total, lane);
-    if (lane == 0u) { sums[rows.first + group.x] = rows.factor * sum; }
+    if (lane == 0u) { sums[rows.first + row] = rows.factor * sum; }
 }
 
 // slopes [3, 3, H, W] into `out`: see `loss_kernels._similarity_row`. parts: sums of SSIM.
-@compute @workgroup_size(16, 16)
-fn similarity(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u,
-              @builtin(local_invocation_id) local: vec3u,
-              @builtin(local_invocation_index) lane: u32) {
-    let number = group_of(group, groups);
+@compute @workgroup_size(256)
+fn similarity(at_work: Place) {
+    let lane = at_work.lane;
+    let number = group_of(at_work);
     let here = square(number);
     let mean = means[min(here.z, 2u)];
     for (var k = lane; k < AREA; k += 256u) {
@@ -139,7 +140,7 @@ fn similarity(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) grou
     let by_cov = 2.0 * c * inverse;
     let by_both = by_cov * other * a * inverse;
     let by_mean = 2.0 * d * inverse * m_d * (full_x * m_d * b * inverse - 1.0);
-    let at = place(here, (local.y + RADIUS) * SIDE + local.x + RADIUS);
+    let at = place(here, (lane / 16u + RADIUS) * SIDE + lane % 16u + RADIUS);
     if (at >= 0) {
         let plane = 3u * p.width * p.height;
         out[u32(at)] = by_mean - m_x * by_both + m_d * by_cov;
@@ -152,11 +153,10 @@ fn similarity(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) grou
 
 // v_image [3, H, W] into `out`: weight x the gradient of H x W x loss, 0 where the mask ignores.
 // parts: sums of |picture - target|.
-@compute @workgroup_size(16, 16)
-fn loss_gradient(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u,
-                 @builtin(local_invocation_id) local: vec3u,
-                 @builtin(local_invocation_index) lane: u32) {
-    let number = group_of(group, groups);
+@compute @workgroup_size(256)
+fn loss_gradient(at_work: Place) {
+    let lane = at_work.lane;
+    let number = group_of(at_work);
     let here = square(number);
     let area = p.width * p.height;
     for (var k = lane; k < AREA; k += 256u) {
@@ -183,7 +183,7 @@ fn loss_gradient(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) g
         let at = lane + 16u * tap;
         found += WINDOW[tap] * vec3f(filtered[0][at], filtered[1][at], filtered[2][at]);
     }
-    let at = place(here, (local.y + RADIUS) * SIDE + local.x + RADIUS);
+    let at = place(here, (lane / 16u + RADIUS) * SIDE + lane % 16u + RADIUS);
     var apart = 0.0;
     if (at >= 0) {
         let d = image[at] - wanted[at];
