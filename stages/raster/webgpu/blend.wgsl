@@ -11,7 +11,6 @@ const TILE = 16u;
 const NEVER = 0x40000000u; // the last entry drawn in a pixel that was not finished
 const SUMS = 9u; // of the backward pass: by u, t, u u, t t, u t, 1, and by red, green, blue
 const BATCH = 7u; // splats that are summed together: 63 sums, one for each lane but one
-const LARGEST_WEIGHT = 3u; // column of the contributions of which the largest is taken
 
 struct Picture {
     width: u32,
@@ -22,6 +21,7 @@ struct Picture {
     green: f32,
     blue: f32,
     depths: u32,
+    largest: u32, // column of which not the sum, but the largest is taken; SUMS for none
 }
 
 @group(0) @binding(0) var<uniform> picture: Picture;
@@ -54,31 +54,28 @@ fn pixels_of(tile: u32, lane: u32) -> Pixels {
 struct Frame {
     u: f32,
     t: f32,
-    u_x: f32,
-    u_y: f32,
-    t_x: f32,
-    t_y: f32,
+    by_u: vec2<f32>,
+    by_t: vec2<f32>,
 }
 
 // Coordinates in the picture have 13 bits and the first part of K has 11: their product is exact.
 fn frame_of(row: u32, corner: vec2<f32>) -> Frame {
     let at = records[4 * row];
     let slope = records[4 * row + 1].xy;
-    let tall = records[4 * row + 3].y;
-    let major = select(corner.x, corner.y, tall != 0);
-    let minor = select(corner.y, corner.x, tall != 0);
-    let u = (major - at.x) - at.y;
-    let t = ((minor - at.z) - slope.x * major) - (slope.y * major + at.w);
-    let k = slope.x + slope.y;
-    return Frame(u, t, 1 - tall, tall, select(-k, 1.0, tall != 0), select(1.0, -k, tall != 0));
+    let tall = records[4 * row + 3].y != 0;
+    let place = select(corner.xy, corner.yx, tall);
+    let u = (place.x - at.x) - at.y;
+    let t = ((place.y - at.z) - slope.x * place.x) - (slope.y * place.x + at.w);
+    let steps = vec2(-slope.x - slope.y, 1.0);
+    return Frame(u, t, select(vec2(1.0, 0.0), vec2(0.0, 1.0), tall), select(steps.xy, steps.yx, tall));
 }
 
 // Alphas before the cap.
 fn alphas(row: u32, f: Frame, p: Pixels) -> vec4<f32> {
     let a = records[4 * row + 1].z;
     let b = records[4 * row + 1].w;
-    let along = fma(vec4(a * f.u_y), p.j, vec4(fma(a * f.u_x, p.i, a * f.u)));
-    let across = fma(vec4(b * f.t_y), p.j, vec4(fma(b * f.t_x, p.i, b * f.t)));
+    let along = fma(vec4(a * f.by_u.y), p.j, vec4(fma(a * f.by_u.x, p.i, a * f.u)));
+    let across = fma(vec4(b * f.by_t.y), p.j, vec4(fma(b * f.by_t.x, p.i, b * f.t)));
     return records[4 * row + 2].w * exp2(-min(fma(along, along, across * across), vec4(200.0)));
 }
 
@@ -124,7 +121,7 @@ fn blend(here: Place) {
             break;
         }
     }
-    let plane = picture.width * picture.height;
+    let size = picture.width * picture.height;
     let background = vec3(picture.red, picture.green, picture.blue);
     for (var k = 0u; k < 4; k++) {
         if (!p.within[k]) {
@@ -132,12 +129,13 @@ fn blend(here: Place) {
         }
         let at = p.at[k];
         for (var c = 0u; c < 3; c++) {
-            image[c * plane + at] = fma(passing[k], background[c], colour[c][k]);
+            image[c * size + at] = fma(passing[k], background[c], colour[c][k]);
         }
-        image[3 * plane + at] = 1 - passing[k];
+        image[3 * size + at] = 1 - passing[k];
         if (picture.depths != 0) {
-            image[4 * plane + at] = depth[k] / max(1 - passing[k], 0.5 * ALPHA_MIN);
-            image[5 * plane + at] = median[k];
+            let mean = depth[k] / max(1 - passing[k], 0.5 * ALPHA_MIN);
+            image[4 * size + at] = min(mean, 3.4e38);
+            image[5 * size + at] = median[k];
         }
         transmittance[at] = passing[k];
         last[at] = finished_at[k];
@@ -152,40 +150,20 @@ fn blend(here: Place) {
 var<workgroup> parts: array<f32, 4032>; // [BATCH, SUMS, LANES]
 var<workgroup> furthest: atomic<u32>;
 
-fn put(k: u32, column: u32, lane: u32, value: f32) {
-    parts[(k * SUMS + column) * LANES + lane] = value;
+// A lane on its way from far to near: the entries from the tile's first that are left, and what
+// reaches the last of them.
+struct Walk {
+    p: Pixels,
+    finished_at: vec4<u32>,
+    start: u32,
+    left: u32,
+    passing: vec4<f32>,
 }
 
-fn put_sum(k: u32, column: u32, lane: u32, values: vec4<f32>) {
-    put(k, column, lane, (values.x + values.y) + (values.z + values.w));
-}
-
-// Each lane begins with another, so that they do not wait for the same bank of memory.
-fn part(lane: u32, i: u32) -> f32 {
-    return parts[lane * LANES + i % LANES];
-}
-
-// Adds up what the lanes have put, or takes the largest in column `largest`, and writes it to the
-// slots of the `count` entries that end with number `end`, last first.
-fn write_sums(start: u32, end: u32, count: u32, lane: u32, largest: u32) {
-    workgroupBarrier();
-    let k = lane / SUMS;
-    let column = lane % SUMS;
-    if (k < count) {
-        var four = vec4(0.0);
-        for (var i = lane; i < lane + LANES; i += 4) {
-            let next = vec4(part(lane, i), part(lane, i + 1), part(lane, i + 2), part(lane, i + 3));
-            four = select(four + next, max(four, next), column == largest);
-        }
-        let sum = (four.x + four.y) + (four.z + four.w);
-        let top = max(max(four.x, four.y), max(four.z, four.w));
-        out[slots[start + end - 1 - k] * SUMS + column] = select(sum, top, column == largest);
-    }
-    workgroupBarrier();
-}
-
-// The number of the tile's entries that reach any pixel, the same for all lanes.
-fn reached(tile: u32, lane: u32, finished_at: vec4<u32>) -> u32 {
+fn walk_of(tile: u32, lane: u32) -> Walk {
+    let p = pixels_of(tile, lane);
+    let ends = vec4(finished[p.at.x], finished[p.at.y], finished[p.at.z], finished[p.at.w]);
+    let finished_at = select(vec4(0u), ends, p.within);
     let most = max(max(finished_at.x, finished_at.y), max(finished_at.z, finished_at.w));
     if (lane == 0) {
         atomicStore(&furthest, 0u); // not every implementation begins with zeros
@@ -193,34 +171,69 @@ fn reached(tile: u32, lane: u32, finished_at: vec4<u32>) -> u32 {
     workgroupBarrier();
     atomicMax(&furthest, most);
     workgroupBarrier();
-    return min(atomicLoad(&furthest), starts[tile + 1] - starts[tile]);
+    let left = min(atomicLoad(&furthest), starts[tile + 1] - starts[tile]);
+    let over = vec4(left_over[p.at.x], left_over[p.at.y], left_over[p.at.z], left_over[p.at.w]);
+    return Walk(p, finished_at, starts[tile], left, select(vec4(0.0), over, p.within));
 }
 
-fn plane_of(channel: u32, p: Pixels) -> vec4<f32> {
-    let first = channel * picture.width * picture.height;
-    var found = vec4(0.0);
-    for (var k = 0u; k < 4; k++) {
-        if (p.within[k]) {
-            found[k] = planes[first + p.at[k]];
+// The splat of the last entry that is left.
+struct Layer {
+    row: u32,
+    frame: Frame,
+    raw: vec4<f32>, // alpha before the cap
+    alpha: vec4<f32>,
+    inverse: vec4<f32>, // 1 / (1 - alpha)
+    weight: vec4<f32>,
+    colour: vec3<f32>,
+}
+
+fn next_layer(w: ptr<function, Walk>) -> Layer {
+    let row = members[(*w).start + (*w).left - 1];
+    let frame = frame_of(row, (*w).p.corner);
+    let raw = alphas(row, frame, (*w).p);
+    let drawn = (raw >= vec4(ALPHA_MIN)) & ((*w).finished_at >= vec4((*w).left));
+    let alpha = select(vec4(0.0), min(raw, vec4(ALPHA_MAX)), drawn);
+    let inverse = 1 / (1 - alpha);
+    (*w).passing *= inverse;
+    (*w).left -= 1;
+    let colour = records[4 * row + 2].xyz;
+    return Layer(row, frame, raw, alpha, inverse, alpha * (*w).passing, colour);
+}
+
+fn plane(channel: u32, p: Pixels) -> vec4<f32> {
+    let at = p.at + channel * picture.width * picture.height;
+    return select(vec4(0.0), vec4(planes[at.x], planes[at.y], planes[at.z], planes[at.w]), p.within);
+}
+
+fn put(k: u32, column: u32, lane: u32, values: vec4<f32>) {
+    let top = max(max(values.x, values.y), max(values.z, values.w));
+    let sum = (values.x + values.y) + (values.z + values.w);
+    parts[(k * SUMS + column) * LANES + lane] = select(sum, top, column == picture.largest);
+}
+
+// Each lane begins with another, so that they do not wait for the same bank of memory.
+fn part(lane: u32, i: u32) -> f32 {
+    return parts[lane * LANES + i % LANES];
+}
+
+// Adds up what the lanes have put, and writes it to the slots of the `count` entries that follow
+// the walk, last first.
+fn write_sums(w: Walk, count: u32, lane: u32) {
+    workgroupBarrier();
+    let k = lane / SUMS;
+    let column = lane % SUMS;
+    if (k < count) {
+        var four = vec4(0.0);
+        for (var i = lane; i < lane + LANES; i += 4) {
+            let next = vec4(part(lane, i), part(lane, i + 1), part(lane, i + 2), part(lane, i + 3));
+            four = select(four + next, max(four, next), column == picture.largest);
         }
+        let sum = (four.x + four.y) + (four.z + four.w);
+        let top = max(max(four.x, four.y), max(four.z, four.w));
+        let slot = slots[w.start + w.left + count - 1 - k];
+        out[slot * SUMS + column] = select(sum, top, column == picture.largest);
     }
-    return found;
-}
-
-struct Pass {
-    passing: vec4<f32>,
-    finished_at: vec4<u32>,
-}
-
-fn pass_of(p: Pixels) -> Pass {
-    var found = Pass(vec4(0.0), vec4(0u));
-    for (var k = 0u; k < 4; k++) {
-        if (p.within[k]) {
-            found.passing[k] = left_over[p.at[k]];
-            found.finished_at[k] = finished[p.at[k]];
-        }
-    }
-    return found;
+    workgroupBarrier();
 }
 
 // out at each entry's slot, zero before: gradients of the splat's exponent and colour, planes being
@@ -232,52 +245,39 @@ fn gradient(here: Place) {
     if (tile >= picture.tiles) {
         return;
     }
-    let p = pixels_of(tile, lane);
-    let v_r = plane_of(0, p);
-    let v_g = plane_of(1, p);
-    let v_b = plane_of(2, p);
-    let begun = pass_of(p);
-    var passing = begun.passing;
-    var behind = (v_r * picture.red + v_g * picture.green + v_b * picture.blue) * passing;
-    let start = starts[tile];
-    let count = reached(tile, lane, begun.finished_at);
-    for (var done = 0u; done < count; done += BATCH) {
-        let together = min(BATCH, count - done);
+    var w = walk_of(tile, lane);
+    let p = w.p;
+    let v_r = plane(0, p);
+    let v_g = plane(1, p);
+    let v_b = plane(2, p);
+    var behind = (v_r * picture.red + v_g * picture.green + v_b * picture.blue) * w.passing;
+    while (w.left > 0) {
+        let together = min(BATCH, w.left);
         for (var k = 0u; k < together; k++) {
-            let number = count - done - k;
-            let row = members[start + number - 1];
-            let f = frame_of(row, p.corner);
-            let raw = alphas(row, f, p);
-            let drawn = (raw >= vec4(ALPHA_MIN)) & (begun.finished_at >= vec4(number));
-            let alpha = select(vec4(0.0), min(raw, vec4(ALPHA_MAX)), drawn);
-            let inverse = 1 / (1 - alpha);
-            passing *= inverse;
-            let weight = alpha * passing;
-            let shown = records[4 * row + 2];
-            let shade = v_r * shown.x + v_g * shown.y + v_b * shown.z;
-            let by_exponent = alpha * (behind * inverse - passing * shade);
-            behind = fma(weight, shade, behind);
+            let one = next_layer(&w);
+            let shade = v_r * one.colour.x + v_g * one.colour.y + v_b * one.colour.z;
+            let by_exponent = one.alpha * (behind * one.inverse - w.passing * shade);
+            behind = fma(one.weight, shade, behind);
             // no gradient where alpha is capped
-            let v = select(vec4(0.0), by_exponent, raw < vec4(ALPHA_MAX));
-            let origin = records[4 * row + 3].zw;
-            let slope = records[4 * row + 1].xy;
-            let tall = f.u_y != 0;
-            let major = select(p.corner.x, p.corner.y, tall);
-            let minor = select(p.corner.y, p.corner.x, tall);
-            let first_t = ((minor - origin.y) - slope.x * major) - slope.y * major;
-            let u = fma(p.j, vec4(f.u_y), vec4(fma(p.i, f.u_x, major - origin.x)));
-            let t = fma(p.j, vec4(f.t_y), vec4(fma(p.i, f.t_x, first_t)));
-            put_sum(k, 0, lane, v * u);
-            put_sum(k, 1, lane, v * t);
-            put_sum(k, 2, lane, v * u * u);
-            put_sum(k, 3, lane, v * t * t);
-            put_sum(k, 4, lane, v * u * t);
-            put_sum(k, 5, lane, v);
-            put_sum(k, 6, lane, weight * v_r);
-            put_sum(k, 7, lane, weight * v_g);
-            put_sum(k, 8, lane, weight * v_b);
+            let v = select(vec4(0.0), by_exponent, one.raw < vec4(ALPHA_MAX));
+            let f = one.frame;
+            let origin = records[4 * one.row + 3].zw;
+            let slope = records[4 * one.row + 1].xy;
+            let place = select(p.corner.xy, p.corner.yx, f.by_u.y != 0);
+            let first_t = ((place.y - origin.y) - slope.x * place.x) - slope.y * place.x;
+            let u = fma(p.j, vec4(f.by_u.y), vec4(fma(p.i, f.by_u.x, place.x - origin.x)));
+            let t = fma(p.j, vec4(f.by_t.y), vec4(fma(p.i, f.by_t.x, first_t)));
+            put(k, 0, lane, v * u);
+            put(k, 1, lane, v * t);
+            put(k, 2, lane, v * u * u);
+            put(k, 3, lane, v * t * t);
+            put(k, 4, lane, v * u * t);
+            put(k, 5, lane, v);
+            put(k, 6, lane, one.weight * v_r);
+            put(k, 7, lane, one.weight * v_g);
+            put(k, 8, lane, one.weight * v_b);
         }
-        write_sums(start, count - done, together, lane, SUMS);
+        write_sums(w, together, lane);
     }
 }
 
@@ -290,43 +290,30 @@ fn contributions(here: Place) {
     if (tile >= picture.tiles) {
         return;
     }
-    let p = pixels_of(tile, lane);
-    let errors = array(plane_of(0, p), plane_of(1, p), plane_of(2, p));
-    let background = vec3(picture.red, picture.green, picture.blue);
-    let begun = pass_of(p);
-    var passing = begun.passing;
-    var behind = array(passing * background.x, passing * background.y, passing * background.z);
-    let start = starts[tile];
-    let count = reached(tile, lane, begun.finished_at);
-    for (var done = 0u; done < count; done += BATCH) {
-        let together = min(BATCH, count - done);
+    var w = walk_of(tile, lane);
+    let errors = array(plane(0, w.p), plane(1, w.p), plane(2, w.p));
+    var behind = array(w.passing * picture.red, w.passing * picture.green, w.passing * picture.blue);
+    while (w.left > 0) {
+        let together = min(BATCH, w.left);
         for (var k = 0u; k < together; k++) {
-            let number = count - done - k;
-            let row = members[start + number - 1];
-            let raw = alphas(row, frame_of(row, p.corner), p);
-            let drawn = (raw >= vec4(ALPHA_MIN)) & (begun.finished_at >= vec4(number));
-            let alpha = select(vec4(0.0), min(raw, vec4(ALPHA_MAX)), drawn);
-            let inverse = 1 / (1 - alpha);
-            passing *= inverse;
-            let weight = alpha * passing;
-            let shown = records[4 * row + 2];
+            let one = next_layer(&w);
             var change = vec4(0.0);
             var square = vec4(0.0);
             for (var c = 0u; c < 3; c++) {
-                let painted = weight * shown[c];
-                let shift = behind[c] * (alpha * inverse) - painted;
+                let painted = one.weight * one.colour[c];
+                let shift = behind[c] * (one.alpha * one.inverse) - painted;
                 change += shift * (shift + 2 * errors[c]);
                 square += shift * shift;
                 behind[c] += painted;
-                put_sum(k, 5 + c, lane, weight * errors[c]);
+                put(k, 5 + c, lane, one.weight * errors[c]);
             }
-            put_sum(k, 0, lane, change);
-            put_sum(k, 1, lane, square);
-            put_sum(k, 2, lane, weight);
-            put(k, LARGEST_WEIGHT, lane, max(max(weight.x, weight.y), max(weight.z, weight.w)));
-            put_sum(k, 4, lane, weight * weight);
-            put(k, 8, lane, 0);
+            put(k, 0, lane, change);
+            put(k, 1, lane, square);
+            put(k, 2, lane, one.weight);
+            put(k, 3, lane, one.weight); // of which the largest is taken
+            put(k, 4, lane, one.weight * one.weight);
+            put(k, 8, lane, vec4(0.0));
         }
-        write_sums(start, count - done, together, lane, LARGEST_WEIGHT);
+        write_sums(w, together, lane);
     }
 }

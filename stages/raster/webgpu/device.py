@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.errors import ResourceError
-from stages.base.text import size as size_text
 from stages.raster import definition
 from stages.raster.definition import MemoryFull
 
@@ -34,6 +33,7 @@ FOLDER = Path(__file__).parent
 MOST_GROUPS = 65535  # in one dimension of a dispatch
 BYTES_A_SPLAT = 2200  # of training, degree 3: an estimate
 _SLOT, _SLOTS = 256, 512  # bytes for the numbers of a dispatch; dispatches in one submission
+_TOO_LARGE = re.compile("[Bb]uffer (size|binding)")  # of what wgpu says
 _CONSTANTS = (
     *("ALPHA_MIN", "ALPHA_MAX", "TRANSMITTANCE_MIN", "LOG_SCALE_MAX", "SCALE_MAX", "COLOUR_MAX"),
     *("QUATERNION_MIN", "MEAN", "ROTATION", "LOG_SCALE", "OPACITY", "SH", "CONTRIBUTIONS"),
@@ -294,18 +294,16 @@ def errors_explained(splats: int) -> Iterator[None]:
     """Turn errors of the device, while it works on so many splats, into SplatError."""
     try:
         yield
-    except wgpu.GPUOutOfMemoryError as error:
-        raise MemoryFull(splats, splats // 2, "the device refused a buffer") from error
-    except wgpu.GPUValidationError as error:
-        most = device().largest
-        if not re.search("[Bb]uffer (size|binding)", str(error)):
-            raise
-        fits = min(splats // 2, int(0.9 * most / 256))
-        raise MemoryFull(splats, fits, f"one buffer holds {size_text(most)}") from error
     except wgpu.GPUError as error:
+        said = str(error).strip().rpartition("\n")[2].strip()
+        if isinstance(error, wgpu.GPUOutOfMemoryError) or _TOO_LARGE.search(said):
+            fits = min(splats // 2, device().largest // 256)
+            raise MemoryFull(splats, fits, said) from error
+        if isinstance(error, wgpu.GPUValidationError) and "device is lost" not in said:
+            raise  # of this program
         raise ResourceError(
             "raster-webgpu-failed",
-            given=f"The GPU stopped: {(str(error).splitlines() or [''])[0]}.",
+            given=f"The GPU stopped: {said}.",
             wanted="A GPU that answers.",
             hint="Run `splat doctor`, close other programs on the card, or choose --backend cpu.",
         ) from error

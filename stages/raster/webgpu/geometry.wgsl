@@ -32,8 +32,8 @@ struct Footprint {
     a: f32,
     b: f32,
     c: f32,
-    det: f32,
-    minors: f32,
+    root: f32, // of the determinant
+    area: f32, // root of the determinant without dilation
     dilation: f32,
     opacity: f32, // as drawn
     mean: vec2<f32>, // pixels
@@ -107,7 +107,7 @@ fn footprint(at: u32, i: u32) -> Footprint {
     let kept = f.ratios.x * f.ratios.y * f.ratios.z;
     f.opacity = kept / (1 + exp(-rows[at + OPACITY]));
     if (view.cam[5].z != 0) {
-        f.opacity *= sqrt(f.minors / f.det);
+        f.opacity *= f.area / f.root;
     }
     return f;
 }
@@ -122,17 +122,22 @@ fn measure(f: ptr<function, Footprint>) {
     (*f).x *= unit;
     (*f).y *= unit;
     (*f).scales *= unit;
-    let x = (*f).x;
-    let y = (*f).y;
-    let minors = cross(x, y);
-    (*f).minors = dot(minors, minors);
-    let a = dot(x, x);
-    let c = dot(y, y);
+    let a = dot((*f).x, (*f).x);
+    let c = dot((*f).y, (*f).y);
     (*f).dilation = e * unit * unit;
-    (*f).det = (*f).minors + (*f).dilation * (a + c) + (*f).dilation * (*f).dilation;
     (*f).a = a + (*f).dilation;
-    (*f).b = dot(x, y);
+    (*f).b = dot((*f).x, (*f).y);
     (*f).c = c + (*f).dilation;
+    let minors = cross((*f).x, (*f).y);
+    (*f).area = norm(vec4(minors, 0.0));
+    (*f).root = norm(vec4(minors, sqrt(e) * unit * sqrt(a + c + (*f).dilation)));
+}
+
+// No square overflows or vanishes.
+fn norm(v: vec4<f32>) -> f32 {
+    let parts = abs(v);
+    let largest = max(max(max(parts.x, parts.y), max(parts.z, parts.w)), 1e-37);
+    return largest * sqrt(dot(parts / largest, parts / largest));
 }
 
 // The unit vector from the camera to a splat, and the distance.

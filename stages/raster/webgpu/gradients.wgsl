@@ -6,6 +6,7 @@
 //include geometry.wgsl
 
 const LARGEST_KEPT = 3.4e38; // no gradient becomes infinite
+const LEAST = 1e-37; // a square that vanishes: of a splat 1e18 times as long as wide
 const SUMS = 9u; // see blend.wgsl
 
 @group(0) @binding(3) var<storage, read> keys: array<u32>;
@@ -41,6 +42,10 @@ fn colour_gradient(at: u32, i: u32) -> vec3<f32> {
     return (along - dot(along, d.xyz) * d.xyz) / d.w;
 }
 
+fn determinant(f: Footprint) -> f32 {
+    return max(f.root * f.root, LEAST);
+}
+
 // Gradients with respect to the mean in the picture, and in order to A, B and K of the exponent
 // A u^2 + B (v - K u)^2; to ln(1 / z), to the logarithm of the opacity.
 struct ExponentGradient {
@@ -56,7 +61,7 @@ fn exponent_gradient(i: u32, f: Footprint, tall: bool) -> ExponentGradient {
     let larger = select(f.a, f.c, tall);
     let k = f.b / larger;
     let by_a = 0.5 / larger;
-    let by_b = 0.5 * larger / f.det;
+    let by_b = 0.5 * larger / determinant(f);
     let unit = 1 / f.size;
     let place = select(f.mean.xy, f.mean.yx, tall) * unit;
     let centre = select(view.cam[3].zw, view.cam[3].wz, tall) * unit;
@@ -96,15 +101,16 @@ struct CovarianceGradient {
 
 fn covariance_gradient(f: Footprint, g: ExponentGradient, tall: bool) -> CovarianceGradient {
     let larger = select(f.a, f.c, tall);
-    let g_larger = 0.5 * g.b / f.det - (0.5 * g.a / larger + g.k * f.b / larger) / larger;
-    var g_det = -0.5 * g.b * (larger / f.det) / f.det;
+    let det = determinant(f);
+    let g_larger = 0.5 * g.b / det - (0.5 * g.a / larger + g.k * f.b / larger) / larger;
+    var g_det = -0.5 * g.b * (larger / det) / det;
     var g_minors = 0.0;
     var near = 0.0;
     if (view.cam[5].z != 0) {
-        g_det -= 0.5 * g.drawn / f.det;
-        g_minors = 0.5 * g.drawn / f.minors;
+        g_det -= 0.5 * g.drawn / det;
+        g_minors = 0.5 * g.drawn / max(f.area * f.area, LEAST);
         // the determinant but for the minors, e (a + c), with the dilation that a and c have
-        near = g.drawn * (f.dilation * (f.a + f.c)) / f.det;
+        near = g.drawn * (f.dilation * (f.a + f.c)) / det;
     }
     let both = f.dilation * g_det;
     return CovarianceGradient(

@@ -78,7 +78,7 @@ fn put_record(i: u32, f: Footprint, shown: vec3<f32>) {
     let slope = floor(k * 2048 + 0.5) / 2048;
     let origin = sums_origin(place.x, place.y, k, whole.y, extent.x, extent.y);
     let root_a = sqrt(0.5 / larger) / f.size * SQRT_LOG2E;
-    let root_b = sqrt(0.5 * larger / f.det) / f.size * SQRT_LOG2E;
+    let root_b = sqrt(0.5 * larger) / f.root / f.size * SQRT_LOG2E;
     records[4 * i] = vec4(whole.x, place.x - whole.x, whole.y, cut - whole.y);
     records[4 * i + 1] = vec4(slope, k - slope, root_a, root_b);
     records[4 * i + 2] = vec4(shown, f.opacity);
@@ -98,7 +98,7 @@ fn put_shape(i: u32, f: Footprint) -> bool {
     let tiles = floor(clamp(ends, vec2(0.0), vec2(size.y - 1)) / f32(view.tile));
     let rho = f.b / sqrt(f.a) / sqrt(f.c);
     shapes[2 * i] = vec4(f.mean, box);
-    shapes[2 * i + 1] = vec4(rho, sqrt(f.det / f.a / f.c), tiles);
+    shapes[2 * i + 1] = vec4(rho, f.root / sqrt(f.a) / sqrt(f.c), tiles);
     return true;
 }
 
@@ -118,7 +118,7 @@ fn project(here: Place) {
         return;
     }
     let f = footprint(at, i);
-    if (!is_finite(f.size) || !(f.det > 0) || !(f.opacity >= ALPHA_MIN)) {
+    if (!is_finite(f.size) || !(f.root > 0) || !(f.opacity >= ALPHA_MIN)) {
         return;
     }
     if (put_shape(i, f)) {

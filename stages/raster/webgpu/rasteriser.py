@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,7 @@ from stages.raster import sh
 from stages.raster.camera_row import camera_row
 from stages.raster.definition import (
     CONTRIBUTIONS,
+    LARGEST_WEIGHT,
     SH,
     Arrays,
     Backward,
@@ -24,16 +26,11 @@ from stages.raster.webgpu.device import FOLDER, Buffers, Kernel, errors_explaine
 from stages.scene import Camera
 
 RECORD, SHAPE, SUMS = 16, 8, 9  # numbers of a record, a shape and of the sums of a splat
-LARGEST_WEIGHT = 3
-TILE, BLOCK = 16, 1024  # pixels across; numbers of a workgroup that sorts or scans
+TILE, BLOCK = 16, 1024  # pixels across; numbers that a workgroup sorts or scans
 NOWHERE = 0xFFFFFFFF  # the key of a splat that is not visible
 _HARMONICS = {"C0": sh.C0, "C1": sh.C1}
 _HARMONICS |= {f"C2{k}": value for k, value in enumerate(sh.C2)}
 _HARMONICS |= {f"C3{k}": value for k, value in enumerate(sh.C3)}
-
-
-def _kernel(file: str, entry: str, **constants: float) -> Kernel:
-    return Kernel(FOLDER / f"{file}.wgsl", entry, tuple(constants.items()))
 
 
 @dataclass(frozen=True)
@@ -170,9 +167,9 @@ class WebGpuRasteriser:
         """See `definition.Rasteriser`."""
         n = len(forward.scene)
         with errors_explained(n):
+            planes = self.device.sent(residual)
             sums = self._sums(
-                *("contributions", forward.scene, forward.view, forward.drawn),
-                *(self.device.sent(residual), LARGEST_WEIGHT),
+                "contributions", n, forward.view, forward.drawn, planes, LARGEST_WEIGHT
             )
             found = self.device.read(sums, np.float32, SUMS * n).reshape(n, SUMS)
         return found[forward.visible, :CONTRIBUTIONS].astype(np.float64)
@@ -207,24 +204,15 @@ class WebGpuRasteriser:
     ) -> Drawn:
         """Draw. capacity: number of entries that the lists have room for. By default it is read
         from the device, which waits for the device."""
-        n, get, run = len(scene), self.scratch.get, self.device.run
+        n, get = len(scene), self.scratch.get
         records, shapes = get("records", n * RECORD), get("shapes", n * SHAPE)
         keys, culled = get("keys", n), get("culled", n)
-        run(
-            _kernel("project", "project", COEFFICIENTS=view.coefficients(scene), **_HARMONICS),
-            -(-n // 64),
-            (scene.rows, self._smoothing(scene), records, shapes, keys, culled),
-            self._numbers(scene, view),
-        )
+        self._over_splats("project", scene, view, records, shapes, keys, culled)
         made = self._lists(scene, view, shapes, keys, capacity)
         image = get("image", (6 if depths else 4) * view.pixels)
         transmittance, last = get("transmittance", view.pixels), get("last", view.pixels)
-        run(
-            _kernel("blend", "blend"),
-            view.tiles[1],
-            (records, made.members, made.starts, image, transmittance, last),
-            self._picture(view, made, depths),
-        )
+        buffers = (records, made.members, made.starts, image, transmittance, last)
+        self._run("blend", "blend", view.tiles[1], 1, buffers, _picture(view, depths))
         return Drawn(image, transmittance, last, records, keys, culled, made)
 
     def gradients(
@@ -233,26 +221,35 @@ class WebGpuRasteriser:
         """([n, columns of the scene], [n, 2]) of parameters and of means on the picture, of the
         visible splats; zeros elsewhere. v_image [3, H, W]: a buffer."""
         n, get = len(scene), self.scratch.get
-        sums = self._sums("gradient", scene, view, drawn, v_image, SUMS)
+        sums = self._sums("gradient", n, view, drawn, v_image)
         out, means2d = get("gradients", n * scene.columns), get("means2d", 2 * n)
-        self.device.run(
-            _kernel("gradients", "gradients", COEFFICIENTS=view.coefficients(scene), **_HARMONICS),
-            -(-n // 64),
-            (scene.rows, self._smoothing(scene), drawn.keys, drawn.records, sums, out, means2d),
-            self._numbers(scene, view),
-        )
+        buffers = (drawn.keys, drawn.records, sums, out, means2d)
+        self._over_splats("gradients", scene, view, *buffers)
         return out, means2d
 
-    def _smoothing(self, scene: DeviceScene) -> Any:
-        return self.scratch.get("none", 1) if scene.smoothing is None else scene.smoothing
+    def _run(
+        self,
+        file: str,
+        entry: str,
+        items: int,
+        lanes: int,
+        buffers: Sequence[Any],
+        numbers: Sequence[float],
+    ) -> None:
+        """Record a dispatch over so many items, of which a workgroup has `lanes`."""
+        self.device.run(
+            Kernel(FOLDER / f"{file}.wgsl", entry), -(-items // lanes), buffers, numbers
+        )
 
-    def _numbers(self, scene: DeviceScene, view: DeviceView) -> tuple[float, ...]:
-        used, smoothed = used_columns(scene.coefficients), int(scene.smoothing is not None)
-        return (*view.cam, len(scene), scene.columns, used, smoothed, TILE)
-
-    def _picture(self, view: DeviceView, made: Lists, depths: bool = False) -> tuple[float, ...]:
-        colour = map(float, view.settings.background)
-        return (view.width, view.height, *view.tiles, *colour, int(depths))
+    def _over_splats(self, name: str, scene: DeviceScene, view: DeviceView, *buffers: Any) -> None:
+        """Record a dispatch of a kernel that computes footprints."""
+        constants = {"COEFFICIENTS": view.coefficients(scene), **_HARMONICS}
+        kernel = Kernel(FOLDER / f"{name}.wgsl", name, tuple(constants.items()))
+        smoothed = scene.smoothing is not None
+        widths = scene.smoothing if smoothed else self.scratch.get("none", 1)
+        used = used_columns(scene.coefficients)
+        numbers = (*view.cam, len(scene), scene.columns, used, int(smoothed), TILE)
+        self.device.run(kernel, -(-len(scene) // 64), (scene.rows, widths, *buffers), numbers)
 
     def _lists(
         self,
@@ -262,104 +259,70 @@ class WebGpuRasteriser:
         keys: Any,
         capacity: int | None,
     ) -> Lists:
-        n, (across, tiles) = len(scene), view.tiles
-        get, run = self.scratch.get, self.device.run
+        n, (across, tiles), get = len(scene), view.tiles, self.scratch.get
         counts, ordered, ends = get("counts", n), get("ordered", n), get("ends", n + 1)
 
-        def numbers(room: int, counting: int = 0) -> tuple[int, ...]:
-            return (
-                *(n, room, across, tiles, view.width, TILE, scene.columns),
-                *(used_columns(scene.coefficients), counting),
-            )
+        def run(entry: str, items: int, room: int, *buffers: Any) -> None:
+            counting = int(entry == "tiles" and not room)
+            numbers = (n, room, across, tiles, view.width, TILE, scene.columns)
+            used = used_columns(scene.coefficients)
+            self._run("lists", entry, items, 64, buffers, (*numbers, used, counting))
 
-        def find(room: int, counting: int) -> None:
-            entries = (get("tile_of", max(1, room)), get("row_of", max(1, room)))
-            run(
-                _kernel("lists", "tiles"),
-                -(-(n if counting else room) // 64),
-                (shapes, keys, counts, ordered, ends, *entries),
-                numbers(room, counting),
-            )
-
-        find(0, 1)
+        none = get("tile_of", 1), get("row_of", 1)
+        run("tiles", n, 0, shapes, keys, counts, ordered, ends, *none)
         sorted_keys, order = self._sorted("depth", keys, n, 32)
-        run(
-            _kernel("lists", "ties"),
-            -(-(n + 1) // 64),
-            (scene.rows, sorted_keys, order, counts, ordered, ends),
-            numbers(0),
-        )
+        run("ties", n + 1, 0, scene.rows, sorted_keys, order, counts, ordered, ends)
         self._scan(ends, n + 1)
         room = int(self.device.read(ends, np.uint32, 1, n)[0]) if capacity is None else capacity
-        find(room, 0)
-        sorted_tiles, slots = self._sorted("tile", get("tile_of", 1), room, tiles.bit_length())
+        tile_of, row_of = get("tile_of", room), get("row_of", room)
+        run("tiles", room, room, shapes, keys, counts, ordered, ends, tile_of, row_of)
+        sorted_tiles, slots = self._sorted("tile", tile_of, room, tiles.bit_length())
         members, starts, firsts = get("members", room), get("starts", tiles + 1), get("firsts", n)
-        run(
-            _kernel("lists", "arrange"),
-            -(-max(room, n, tiles + 1) // 64),
-            (sorted_tiles, slots, get("row_of", 1), members, starts, ordered, ends, firsts),
-            numbers(room),
-        )
+        buffers = (sorted_tiles, slots, row_of, members, starts, ordered, ends, firsts)
+        run("arrange", max(room, n, tiles + 1), room, *buffers)
         return Lists(members, slots, starts, firsts, counts, ends, room)
 
     def _sorted(self, name: str, keys: Any, n: int, bits: int) -> tuple[Any, Any]:
-        """(keys sorted by their lowest `bits`, the places that they had): new buffers."""
-        get, run = self.scratch.get, self.device.run
-        blocks = -(-n // BLOCK)
-        table = get("table", 16 * blocks)
-        from_values, free = get(f"{name} values a", n), get(f"{name} values b", n)
-        free_keys = [get(f"{name} keys a", n), get(f"{name} keys b", n)]
+        """(keys sorted by their lowest `bits`, the places that they had): buffers of that name."""
+        get, blocks = self.scratch.get, -(-n // BLOCK)
+        table, values, free = (get("table", 16 * blocks), get(f"{name} 0", n), get(f"{name} 1", n))
+        free_keys = get(f"{name} 2", n), get(f"{name} 3", n)
         for shift in range(0, bits, 4):
-            given = (n, shift, blocks, int(shift == 0))
-            run(_kernel("sort", "count"), blocks, (keys, table), given)
+            numbers, moved = (n, shift, blocks, int(shift == 0)), free_keys[shift // 4 % 2]
+            self._run("sort", "count", n, BLOCK, (keys, table), numbers)
             self._scan(table, 16 * blocks)
-            moved = free_keys[shift // 4 % 2]
-            run(
-                _kernel("sort", "scatter"),
-                blocks,
-                (keys, table, from_values, moved, free),
-                given,
-            )
-            keys, from_values, free = moved, free, from_values
-        return keys, from_values
+            self._run("sort", "scatter", n, BLOCK, (keys, table, values, moved, free), numbers)
+            keys, values, free = moved, free, values
+        return keys, values
 
     def _scan(self, values: Any, n: int, level: int = 0) -> None:
         """Replace n numbers by the sums of those before each."""
         blocks = -(-n // BLOCK)
-        sums = self.scratch.get(f"sums {level}", blocks)
-        self.device.run(_kernel("scan", "scan"), blocks, (values, sums), (n,))
+        buffers = values, self.scratch.get(f"sums {level}", blocks)
+        self._run("scan", "scan", n, BLOCK, buffers, (n,))
         if blocks > 1:
-            self._scan(sums, blocks, level + 1)
-            self.device.run(_kernel("scan", "add"), blocks, (values, sums), (n,))
+            self._scan(buffers[1], blocks, level + 1)
+            self._run("scan", "add", n, BLOCK, buffers, (n,))
 
     def _sums(
-        self,
-        kernel: str,
-        scene: DeviceScene,
-        view: DeviceView,
-        drawn: Drawn,
-        planes: Any,
-        largest: int,
+        self, entry: str, n: int, view: DeviceView, drawn: Drawn, planes: Any, largest: int = SUMS
     ) -> Any:
-        """[n, SUMS]: what a kernel of `blend.wgsl` finds for each splat, from far to near over
-        every tile's list. largest: the column of which the largest is taken."""
-        made, n = drawn.lists, len(scene)
-        raw = self.scratch.get("raw", made.capacity * SUMS)
+        """[n, SUMS]: what an entry point of `blend.wgsl` finds for each splat in every tile's list.
+        largest: the column of which the largest is taken."""
+        made = drawn.lists
+        raw, sums = (
+            self.scratch.get("raw", made.capacity * SUMS),
+            self.scratch.get("sums", n * SUMS),
+        )
         self.device.clear(raw, made.capacity * SUMS)
-        self.device.run(
-            _kernel("blend", kernel),
-            view.tiles[1],
-            (
-                *(drawn.records, made.members, made.starts, made.slots, drawn.transmittance),
-                *(drawn.last, planes, raw),
-            ),
-            self._picture(view, made),
-        )
-        sums = self.scratch.get("sums", n * SUMS)
-        self.device.run(
-            _kernel("sums", "add_up"),
-            -(-n // 8),
-            (raw, made.firsts, made.counts, sums),
-            (n, made.capacity, largest),
-        )
+        lists = (made.members, made.starts, made.slots)
+        buffers = (drawn.records, *lists, drawn.transmittance, drawn.last, planes, raw)
+        self._run("blend", entry, view.tiles[1], 1, buffers, _picture(view, False, largest))
+        numbers = (n, made.capacity, largest)
+        self._run("sums", "add_up", n * SUMS, 64, (raw, made.firsts, made.counts, sums), numbers)
         return sums
+
+
+def _picture(view: DeviceView, depths: bool, largest: int = SUMS) -> tuple[float, ...]:
+    colour = map(float, view.settings.background)
+    return (view.width, view.height, *view.tiles, *colour, int(depths), largest)
