@@ -53,8 +53,9 @@ class WebGpuStep:
     @property
     def skipped(self) -> int:
         """See `step.TrainingStep`; waits for the device."""
-        for arrival in self._arrivals:
-            arrival()
+        with errors_explained(len(self)):
+            for arrival in self._arrivals:
+                arrival()
         return self._skipped
 
     def load(self, model: Model) -> None:

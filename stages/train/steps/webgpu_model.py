@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from stages.raster.definition import LOG_SCALE, MEAN, OPACITY, ROTATION, SH, SH_REST, used_columns
-from stages.raster.webgpu.device import Device, Kernel
+from stages.raster.webgpu.device import Device, Kernel, errors_explained
 from stages.raster.webgpu.rasteriser import DeviceScene, WebGpuRasteriser
 from stages.train import dropout, optimiser
 from stages.train.optimiser import STEP_COUNTS, Model
@@ -79,7 +79,8 @@ class WebGpuHeld:
     def column(self, name: str) -> Tensor:
         """See `device_model.Held`; on the host."""
         if name not in self._read:
-            self._read[name] = torch.from_numpy(self._column(name))
+            with errors_explained(len(self)):
+                self._read[name] = torch.from_numpy(self._column(name))
         return self._read[name]
 
     def _column(self, name: str) -> NDArray[Any]:

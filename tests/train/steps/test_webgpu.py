@@ -8,7 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stages.raster.definition import RasterSettings
+wgpu: Any = pytest.importorskip("wgpu")
+
+from stages.base.errors import ResourceError
+from stages.raster.definition import MemoryFull, RasterSettings
 from stages.raster.reference_rasteriser import ReferenceRasteriser
 from stages.raster.webgpu import device
 from stages.raster.webgpu.rasteriser import WebGpuRasteriser
@@ -132,3 +135,36 @@ def test_an_empty_model_is_drawn_and_trained():
     assert not made.draw(camera(40, 30), SETTINGS, smooth=False).any()
     made.load(made.model().take(np.zeros(0, bool)).in_morton_order())
     assert len(made) == len(made.model().on_host()) == 0
+
+
+@pytest.fixture
+def own_device():
+    """Of this test alone."""
+    device.device.cache_clear()
+    yield
+    device.device.cache_clear()
+
+
+def test_a_device_that_is_lost_is_said_to_have_stopped(own_device):
+    made = stepper(lag=3)
+    made.step(StepInput(level(), SETTINGS, RATES))
+    made.gpu.wgpu.destroy()
+    for work in (
+        lambda: made.step(StepInput(level(), SETTINGS, RATES)),
+        lambda: made.model().means,
+    ):
+        with pytest.raises(ResourceError) as caught:
+            work()
+        assert caught.value.code == "raster-webgpu-failed"
+
+
+def test_more_than_a_buffer_holds_is_said_to_be_too_many_splats(monkeypatch):
+    made = stepper()
+    full = wgpu.GPUOutOfMemoryError("Not enough memory left.")
+
+    def refused(words: int) -> Any:
+        raise full
+
+    monkeypatch.setattr(made.gpu, "empty", refused)
+    with pytest.raises(MemoryFull):
+        made.load(start())
