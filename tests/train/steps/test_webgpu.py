@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-wgpu: Any = pytest.importorskip("wgpu")
-
 from stages.base.errors import ResourceError
 from stages.raster.definition import MemoryFull, RasterSettings
 from stages.raster.reference_rasteriser import ReferenceRasteriser
@@ -160,7 +158,7 @@ def test_a_device_that_is_lost_is_said_to_have_stopped(own_device):
 
 def test_more_than_a_buffer_holds_is_said_to_be_too_many_splats(monkeypatch):
     made = stepper()
-    full = wgpu.GPUOutOfMemoryError("Not enough memory left.")
+    full = pytest.importorskip("wgpu").GPUOutOfMemoryError("Not enough memory left.")
 
     def refused(words: int) -> Any:
         raise full
