@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from stages.raster import backends
-from stages.raster.backends import Backend
+from stages.raster.backends import AUTO, Backend
 from stages.raster.definition import Backward
+from stages.raster.gpu import device as gpu
 from stages.raster.reference_rasteriser import ReferenceRasteriser
+from stages.raster.webgpu import device as webgpu
 from tests.scenes import BACKENDS, camera, cloud, exact_gradients, gradients, relative
 from tests.tolerances import FLOAT32_GRADIENT
 
@@ -55,3 +59,17 @@ def test_an_unknown_backend_is_named_with_those_that_there_are() -> None:
     wanted = "'magic', wanted one of auto, gpu, webgpu, cpu, reference"
     with pytest.raises(ValueError, match=wanted):
         backends.rasteriser_of("magic")
+
+
+@pytest.mark.parametrize(
+    ("kind", "fault", "chosen"),
+    [("IntegratedGPU", "", "webgpu"), ("CPU", "", "cpu"), ("DiscreteGPU", "no adapter", "cpu")],
+)
+def test_auto_takes_webgpu_on_hardware_alone(kind, fault, chosen, monkeypatch) -> None:
+    """An adapter that is a program on the CPU is slower than the kernels for the CPU."""
+    info = {"adapter_type": kind, "device": "this one"}
+    monkeypatch.setattr(gpu, "missing", lambda: "no card")
+    monkeypatch.setattr(webgpu, "missing", lambda: fault)
+    monkeypatch.setattr(webgpu, "_adapter", lambda: SimpleNamespace(info=info))
+    assert backends.backend_of(AUTO).name == chosen
+    assert ("this one" in backends.unavailable_backends(AUTO).get("webgpu", "")) == (kind == "CPU")
