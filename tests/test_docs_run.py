@@ -18,7 +18,9 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 # Without photographs of one's own, a browser or many minutes.
 RUN = ("status", "info", "render", "export", "convert", "edit", "verify", "cameras")
-README = [words for words in splat_commands([ROOT / "README.md"]) if words[1] in RUN]
+OF_ANOTHER_PROGRAM = "smaller"  # the run of README's commands that begin with other splats
+_IN_README = splat_commands([ROOT / "README.md"])
+README = [w for w in _IN_README if w[1] in RUN and OF_ANOTHER_PROGRAM not in w]
 GUIDE = (
     "splat quantise run --sog-loss-db 0.1",
     "splat prune run --rounds 0",
@@ -43,6 +45,23 @@ def test_commands_of_readme_and_guide_run(sample_run: Path, tmp_path: Path) -> N
     for words in [*README, *chosen]:
         done = sample.splat(*words[1:], folder=folder)
         assert done.returncode == 0, f"{words}\n{done.stdout[-1000:]}{done.stderr[-2000:]}"
+
+
+def test_readme_commands_for_splats_of_another_program_run(
+    sample_run: Path, tmp_path: Path
+) -> None:
+    """Its file, the photographs that it trained on, and their COLMAP model, as it names them."""
+    run = sample_run / "run"
+    shutil.copytree(run / "2-sfm" / "colmap" / "images", tmp_path / "photos")
+    shutil.copytree(run / "2-sfm" / "colmap" / "sparse", tmp_path / "sparse")
+    shutil.copy(run / "7-export" / "scene.ply", tmp_path / "point_cloud.ply")
+    commands = [words for words in _IN_README if OF_ANOTHER_PROGRAM in words]
+    assert [words[1] for words in commands] == ["process", "prune", "export"]
+    for words in commands:
+        done = sample.splat(*words[1:], folder=tmp_path)
+        assert done.returncode == 0, f"{words}\n{done.stdout[-1000:]}{done.stderr[-2000:]}"
+    delivered = tmp_path / OF_ANOTHER_PROGRAM / "7-export" / "scene.glb"
+    assert len(formats.read(delivered)) < len(formats.read(tmp_path / "point_cloud.ply"))
 
 
 def test_files_of_a_run_are_those_of_the_architecture_page(sample_run: Path) -> None:
