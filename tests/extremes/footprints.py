@@ -87,8 +87,8 @@ def _compensation_error(backend, scene, view):
     settings = RasterSettings(antialias=True, dilation_px2=dilation)
     if backend == "cpu":
         found = kernels.compensation(scene, view, settings)
-    elif backend == "gpu":
-        found = gpu.opacity(scene, view, settings) / float(scene.opacities[0])
+    elif backend in gpu.COLUMNS:
+        found = gpu.opacity(backend, scene, view, settings) / float(scene.opacities[0])
     else:
         opacities = project(parameters_of(scene), view, settings).opacities.detach()
         found = float(opacities[0]) / float(scene.opacities[0])
@@ -166,7 +166,7 @@ def quaternions_of_any_norm(backend):
         if norm < 1e-20:
             drawn_though_culled += int(drawn.image.any())
             continue
-        if backend == "gpu":
+        if backend in gpu.COLUMNS:
             continue  # its kernels tell no rotation
         if backend == "cpu":
             r = kernels.rotation(scene, view, RasterSettings())

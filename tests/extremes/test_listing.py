@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.extremes.gpu import kept, on_gpu
+from tests.extremes.gpu import COLUMNS, kept, on_gpu
 from tests.extremes.table import ROWS, listing, promises
 
 LISTING = Path(__file__).parents[2] / "docs" / "experiments" / "extremes.md"
@@ -17,8 +17,9 @@ def test_there_is_one_row_for_each_number_of_the_table() -> None:
     assert len({row.name for row in ROWS}) == len(ROWS)
 
 
-def test_the_gpu_column_was_measured_for_every_row_and_holds_its_bounds() -> None:
-    found = kept()
+@pytest.mark.parametrize("real", COLUMNS.values())
+def test_a_gpus_column_was_measured_for_every_row_and_holds_its_bounds(real: str) -> None:
+    found = kept(real)
     assert {row.number for row in ROWS if on_gpu(row)} == found.keys()
     beyond = [m for numbers in found.values() for m in numbers if not m.accepted]
     assert not beyond

@@ -1,8 +1,9 @@
 // Blending of a tile's splats from near to far, and its backward pass from far to near.
 //
-// A tile of 16 x 16 pixels is a workgroup of 64 lanes with four pixels each, below each other: a number for each of the four is a vec4. A splat's gradient is summed over the
-// tile and written to a slot of its own, so that sums have a fixed order. Both passes use `alphas`,
-// because the backward pass divides by 1 - alpha.
+// A tile of 16 x 16 pixels is a workgroup of 64 lanes. A lane has four pixels below each other: a
+// number for each of the four is a vec4. A splat's gradient is summed over the tile and written to a
+// slot of its own, so that sums have a fixed order. Both passes use `alphas`, because the backward
+// pass divides by 1 - alpha.
 
 //include common.wgsl
 
@@ -66,8 +67,9 @@ fn frame_of(row: u32, corner: vec2<f32>) -> Frame {
     let place = select(corner.xy, corner.yx, tall);
     let u = (place.x - at.x) - at.y;
     let t = ((place.y - at.z) - slope.x * place.x) - (slope.y * place.x + at.w);
-    let steps = vec2(-slope.x - slope.y, 1.0);
-    return Frame(u, t, select(vec2(1.0, 0.0), vec2(0.0, 1.0), tall), select(steps.xy, steps.yx, tall));
+    let by_u = select(vec2(1.0, 0.0), vec2(0.0, 1.0), tall);
+    let by_t = vec2(-slope.x - slope.y, 1.0);
+    return Frame(u, t, by_u, select(by_t.xy, by_t.yx, tall));
 }
 
 // Alphas before the cap.
@@ -115,7 +117,8 @@ fn blend(here: Place) {
         let z = vec4(records[4 * row + 3].x);
         depth = fma(weight, z, depth);
         median = select(median, z, (passing >= vec4(0.5)) & (left < vec4(0.5)));
-        finished_at = select(finished_at, vec4(entry - start + 1), drawn & (left < vec4(TRANSMITTANCE_MIN)));
+        let ends = drawn & (left < vec4(TRANSMITTANCE_MIN));
+        finished_at = select(finished_at, vec4(entry - start + 1), ends);
         passing = left;
         if (all(passing < vec4(TRANSMITTANCE_MIN))) {
             break;
@@ -202,7 +205,8 @@ fn next_layer(w: ptr<function, Walk>) -> Layer {
 
 fn plane(channel: u32, p: Pixels) -> vec4<f32> {
     let at = p.at + channel * picture.width * picture.height;
-    return select(vec4(0.0), vec4(planes[at.x], planes[at.y], planes[at.z], planes[at.w]), p.within);
+    let values = vec4(planes[at.x], planes[at.y], planes[at.z], planes[at.w]);
+    return select(vec4(0.0), values, p.within);
 }
 
 fn put(k: u32, column: u32, lane: u32, values: vec4<f32>) {

@@ -39,19 +39,14 @@ struct Footprint {
     mean: vec2<f32>, // pixels
 }
 
-fn turned(v: vec3<f32>) -> vec3<f32> {
-    let c = &view.cam;
-    return vec3(
-        dot(vec3((*c)[0].x, (*c)[0].y, (*c)[0].z), v),
-        dot(vec3((*c)[0].w, (*c)[1].x, (*c)[1].y), v),
-        dot(vec3((*c)[1].z, (*c)[1].w, (*c)[2].x), v),
-    );
+// Its columns are the rows of the rotation from the world to the camera.
+fn rotation() -> mat3x3<f32> {
+    let c = view.cam;
+    return mat3x3(c[0].xyz, vec3(c[0].w, c[1].xy), vec3(c[1].zw, c[2].x));
 }
 
-fn turned_back(v: vec3<f32>) -> vec3<f32> {
-    let c = &view.cam;
-    return (*c)[0].xyz * v.x + vec3((*c)[0].w, (*c)[1].x, (*c)[1].y) * v.y
-        + vec3((*c)[1].z, (*c)[1].w, (*c)[2].x) * v.z;
+fn turned(v: vec3<f32>) -> vec3<f32> {
+    return v * rotation();
 }
 
 fn triple(at: u32) -> vec3<f32> {
@@ -84,10 +79,13 @@ fn footprint(at: u32, i: u32) -> Footprint {
     f.norm = norm * top;
     let w = f.quaternion.x;
     let v = f.quaternion.yzw;
+    let r = 2 * v.yzx * v.zxy; // yz, zx, xy
+    let s = 2 * v * v;
+    let t = 2 * w * v;
     f.axes = mat3x3(
-        turned(vec3(1 - 2 * (v.y * v.y + v.z * v.z), 2 * (v.x * v.y + w * v.z), 2 * (v.x * v.z - w * v.y))),
-        turned(vec3(2 * (v.x * v.y - w * v.z), 1 - 2 * (v.x * v.x + v.z * v.z), 2 * (v.y * v.z + w * v.x))),
-        turned(vec3(2 * (v.x * v.z + w * v.y), 2 * (v.y * v.z - w * v.x), 1 - 2 * (v.x * v.x + v.y * v.y))),
+        turned(vec3(1 - s.y - s.z, r.z + t.z, r.y - t.y)),
+        turned(vec3(r.z - t.z, 1 - s.x - s.z, r.x + t.x)),
+        turned(vec3(r.y + t.y, r.x - t.x, 1 - s.x - s.y)),
     );
     f.scales = exp(triple(at + LOG_SCALE));
     f.ratios = vec3(1.0);
@@ -99,10 +97,9 @@ fn footprint(at: u32, i: u32) -> Footprint {
         f.ratios = f.scales / widened;
         f.scales = widened;
     }
-    let deep = vec3(f.axes[0].z, f.axes[1].z, f.axes[2].z);
-    let along = focal / f.at.z;
-    f.x = along.x * (vec3(f.axes[0].x, f.axes[1].x, f.axes[2].x) - f.slopes.x * deep) * f.scales;
-    f.y = along.y * (vec3(f.axes[0].y, f.axes[1].y, f.axes[2].y) - f.slopes.y * deep) * f.scales;
+    let axes = transpose(f.axes);
+    f.x = focal.x / f.at.z * (axes[0] - f.slopes.x * axes[2]) * f.scales;
+    f.y = focal.y / f.at.z * (axes[1] - f.slopes.y * axes[2]) * f.scales;
     measure(&f);
     let kept = f.ratios.x * f.ratios.y * f.ratios.z;
     f.opacity = kept / (1 + exp(-rows[at + OPACITY]));

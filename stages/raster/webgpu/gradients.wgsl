@@ -122,12 +122,12 @@ fn covariance_gradient(f: Footprint, g: ExponentGradient, tall: bool) -> Covaria
 // Gradient of a quaternion from the gradients of the columns of its rotation matrix.
 fn rotation_gradient(at: u32, f: Footprint, r: mat3x3<f32>) {
     let q = f.quaternion;
-    let n = vec4(
-        2 * (q.y * (r[1].z - r[2].y) + q.z * (r[2].x - r[0].z) + q.w * (r[0].y - r[1].x)),
-        2 * (q.z * (r[1].x + r[0].y) + q.w * (r[2].x + r[0].z) + q.x * (r[1].z - r[2].y)) - 4 * q.y * (r[1].y + r[2].z),
-        2 * (q.y * (r[1].x + r[0].y) + q.w * (r[2].y + r[1].z) + q.x * (r[2].x - r[0].z)) - 4 * q.z * (r[0].x + r[2].z),
-        2 * (q.y * (r[2].x + r[0].z) + q.z * (r[2].y + r[1].z) + q.x * (r[0].y - r[1].x)) - 4 * q.w * (r[0].x + r[1].y),
-    );
+    let v = q.yzw;
+    let turn = vec3(r[1].z - r[2].y, r[2].x - r[0].z, r[0].y - r[1].x);
+    let s = vec3(r[1].z + r[2].y, r[2].x + r[0].z, r[0].y + r[1].x);
+    let d = vec3(r[0].x, r[1].y, r[2].z);
+    let by_v = v.yxx * s.zzy + v.zzy * s.yxx + q.x * turn - 2 * v * (d.yxx + d.zzy);
+    let n = 2 * vec4(dot(v, turn), by_v);
     let g = (n - dot(n, q) * q) / f.norm;
     put_triple(at + ROTATION, g.xyz);
     put(at + ROTATION + 3, g.w);
@@ -147,10 +147,10 @@ fn shape_gradient(at: u32, f: Footprint, g: CovarianceGradient, drawn: f32) -> v
     for (var k = 0; k < 3; k++) {
         let x = along.x * by_x[k];
         let y = along.y * by_y[k];
-        r[k] = turned_back(vec3(x, y, -x * f.slopes.x - y * f.slopes.y));
+        r[k] = rotation() * vec3(x, y, -x * f.slopes.x - y * f.slopes.y);
     }
     rotation_gradient(at, f, r);
-    let deep = vec3(f.axes[0].z, f.axes[1].z, f.axes[2].z);
+    let deep = transpose(f.axes)[2];
     return vec2(dot(by_x, deep), dot(by_y, deep));
 }
 
@@ -185,5 +185,5 @@ fn gradients(here: Place) {
     let by_slope = select(vec2(0.0), -g_deep * focal / f.at.z, f.inside);
     let by_place = (mean * focal + by_slope) / f.at.z;
     let by_depth = -(g.near + c.near + dot(by_slope, f.slopes)) / f.at.z;
-    put_triple(at + MEAN, turned_back(vec3(by_place, by_depth)) + colour_gradient(at, i));
+    put_triple(at + MEAN, rotation() * vec3(by_place, by_depth) + colour_gradient(at, i));
 }

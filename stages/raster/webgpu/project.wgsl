@@ -29,8 +29,7 @@ fn drawable(at: u32, i: u32) -> bool {
     for (var k = 0u; k < view.used; k++) {
         good = good && is_finite(rows[at + k]);
     }
-    let largest_scale = max(max(rows[at + LOG_SCALE], rows[at + LOG_SCALE + 1]), rows[at + LOG_SCALE + 2]);
-    good = good && largest_scale <= LOG_SCALE_MAX;
+    good = good && all(triple(at + LOG_SCALE) <= vec3(LOG_SCALE_MAX));
     var longest = 0.0;
     for (var k = 0u; k < 4; k++) {
         longest = max(longest, abs(rows[at + ROTATION + k]));

@@ -76,14 +76,16 @@ class WebGpuStep:
 
     def step(self, given: StepInput) -> float:
         """See `step.TrainingStep`; the loss is that of LAG steps ago."""
+        try:
+            with errors_explained(len(self)):
+                self._step(given)
+        except MemoryFull:
+            if not self._photographs:
+                raise
+            self._photographs.clear()  # they are sent again one by one
+            with errors_explained(len(self)):
+                self._step(given)
         with errors_explained(len(self)):
-            try:
-                self._step(given)
-            except MemoryFull:
-                if not self._photographs:
-                    raise
-                self._photographs.clear()  # they are sent again one by one
-                self._step(given)
             late = self._arrivals.popleft() if len(self._arrivals) > self.lag else None
             return (late or self._arrivals[-1])()[0]
 

@@ -166,3 +166,21 @@ def test_more_than_a_buffer_holds_is_said_to_be_too_many_splats(monkeypatch):
     monkeypatch.setattr(made.gpu, "empty", refused)
     with pytest.raises(MemoryFull):
         made.load(start())
+
+
+def test_photographs_make_room_where_memory_is_full(monkeypatch):
+    made, refused = stepper(), []
+    made.load(start())
+    made.step(StepInput(level(), SETTINGS, RATES))
+    run = made.gpu.run
+
+    def short_of_memory(*given: Any) -> None:
+        if not refused:
+            refused.extend(made._photographs)
+            raise pytest.importorskip("wgpu").GPUOutOfMemoryError("Not enough memory left.")
+        run(*given)
+
+    monkeypatch.setattr(made.gpu, "run", short_of_memory)
+    made.step(StepInput(level(), SETTINGS, RATES))
+    assert refused
+    assert made._photographs
