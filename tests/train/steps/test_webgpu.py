@@ -169,7 +169,8 @@ def test_more_than_a_buffer_holds_is_said_to_be_too_many_splats(monkeypatch):
 
 
 def test_photographs_make_room_where_memory_is_full(monkeypatch):
-    made, refused = stepper(), []
+    made = stepper()
+    refused: list[int] = []
     made.load(start())
     made.step(StepInput(level(), SETTINGS, RATES))
     run = made.gpu.run
