@@ -18,7 +18,7 @@ _HEADLINES = {
     "ingest": ("photographs", "left_out"),
     "sfm": ("registered_images", "points", "mean_reprojection_error_px"),
     "seed": ("splats",),
-    "train": ("splats", "trained_by"),
+    "train": ("steps", "side_px", "splats", "trained_by"),
     # Later stages measure at sizes of their own: it cannot be compared with that of training.
     "prune": ("splats", "floaters_removed", "psnr_change_db"),
     "quantise": ("sh_degree", "kept_mib"),

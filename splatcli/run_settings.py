@@ -10,7 +10,6 @@ from typing import Any
 import typer
 
 from splatcli import console, options
-from stages.base.errors import UsageError
 from stages.base.settings import UNSET, Setting, changed, settings_of
 from stages.raster.backends import backend_of
 from stages.run.pipeline import Pipeline
@@ -111,8 +110,8 @@ def combined(
     stage takes all options that it has; of several stages each takes what `SHARED_OPTIONS` gives
     it.
 
-    Raises SplatError for a value or a combination that is not allowed, and for a backend that is
-    not available here.
+    Raises SplatError for a value that is not allowed, and for a backend that is not available
+    here.
     """
     chosen = dict(base)
     if preset is not None and "train" in chosen:
@@ -123,14 +122,6 @@ def combined(
         name: changed(settings, given if len(chosen) == 1 else options_of(name, given))
         for name, settings in chosen.items()
     }
-    train = new.get("train")
-    if train is not None and train.steps == 0 and train.splats is None:
-        raise UsageError(
-            "option-alone",
-            given="--steps 0 means nothing without --splats.",
-            wanted="Splats to start from, or steps that train some.",
-            hint="Give --steps, or --splats with what another program trained.",
-        )
     if "backend" in given:  # an error now, not after an hour of other work
         with_backend = [settings for settings in new.values() if hasattr(settings, "backend")]
         for name in {settings.backend for settings in with_backend}:
@@ -150,10 +141,10 @@ def training_summary(settings: TrainSettings, given: Mapping[str, Any], preset: 
     by_origin: dict[str, list[str]] = {}
     recorded = f"preset {preset}" if preset else "as recorded in the run"
     for setting in settings_of(type(settings)):
-        name = setting.name
-        if name in given or _shown(setting) == "by preset":
+        name, value = setting.name, getattr(settings, setting.name)
+        if name in given or (value and _shown(setting) == "by preset"):  # 0: others decide
             origin = "as given" if name in given else recorded
-            value = f"{console.label(name)} {console.figure(name, getattr(settings, name))}"
-            by_origin.setdefault(origin, []).append(value)
-    parts = [f"{', '.join(values)} ({origin})" for origin, values in by_origin.items()]
+            text = f"{console.label(name)} {console.figure(name, value)}"
+            by_origin.setdefault(origin, []).append(text)
+    parts = [f"{', '.join(texts)} ({origin})" for origin, texts in by_origin.items()]
     return f"Training: {'; '.join(parts)}."

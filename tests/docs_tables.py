@@ -198,7 +198,8 @@ def presets() -> str:
     for name, preset in PRESETS.items():
         cap = f"{preset.max_splats:,}" if preset.max_splats else "by memory and photographs"
         size = f"{preset.train_side} px"
-        rows.append((f"`{name}`", f"{preset.steps:,}", size, str(preset.sh_degree), cap))
+        steps = f"{preset.steps:,}" if preset.steps else f"{preset.steps_per_view} a training view"
+        rows.append((f"`{name}`", steps, size, str(preset.sh_degree), cap))
     return _table(("`--preset`", "steps", "size", "SH degree", "splats, at most"), rows)
 
 

@@ -88,8 +88,10 @@ def test_readme_is_short_and_has_both_commands() -> None:
 def test_presets_are_those_of_the_code(page: str) -> None:
     text = (ROOT / page).read_text(encoding="utf-8").replace(",", "")
     for name, preset in PRESETS.items():
-        (row,) = [line for line in text.splitlines() if re.match(rf"\| `{name}`.*steps at", line)]
-        assert f"{preset.steps} steps at {preset.train_side} px" in row
+        (row,) = [line for line in text.splitlines() if re.match(rf"\| `{name}`.*steps.* at", line)]
+        steps = preset.steps or preset.steps_per_view
+        view = "" if preset.steps else " a training view"
+        assert f"{steps} steps{view} at {preset.train_side} px" in row
 
 
 def test_readme_names_every_format() -> None:

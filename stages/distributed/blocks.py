@@ -140,7 +140,8 @@ class _BlockTraining:
     def _coarse(self, seeds: Splats, fewer: int) -> Splats:
         settings = replace(
             self.settings,
-            steps=max(1, self.settings.steps // COARSE_STEPS),
+            steps=-(-self.settings.steps // COARSE_STEPS),
+            steps_per_view=-(-self.settings.steps_per_view // COARSE_STEPS),
             train_side=max(16, self.settings.train_side // COARSE_SIDE),
             max_splats=max(1, self.settings.max_splats // fewer),
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from stages.base.stage import Report
@@ -21,7 +22,7 @@ from stages.scene import (
 from stages.scene.light import spread_ev
 from stages.train.camera_refinement import CameraRefinement
 from stages.train.cap import Cap, cap_for, splats_determined
-from stages.train.schedule import DENSIFYING_PART, LAST_PART, Schedule
+from stages.train.schedule import DENSIFYING_PART, LAST_PART, PUBLISHED_STEPS, Schedule
 from stages.train.settings import TrainSettings
 from stages.train.trainer import Trainer, TrainingTask
 from stages.train.views import load_views
@@ -43,6 +44,7 @@ def make_trainer(
     kept, held = split_held_out(reconstruction.views)
     light = corrects_light(reconstruction, settings.light, report)
     train = load_views(reconstruction.folder, kept, settings.train_side, folder, light)
+    settings = replace(settings, steps=_steps(settings, len(train)))
     given = settings.splats is not None
     antialias = start.draw_settings.antialias if given else settings.antialias
     sh_degree = max(settings.sh_degree if settings.steps else 0, start.sh_degree)
@@ -65,11 +67,12 @@ def make_trainer(
         any_background=settings.background == "any",
         backend=backend,
         seconds=settings.seconds and max(settings.seconds - (time.monotonic() - began), 1.0),
-        most_steps=settings.steps_per_view * len(train),
+        most_steps=settings.steps_per_view
+        and max(settings.steps, settings.steps_per_view * len(train)),
         within=settings.within,
     )
     schedule = Schedule(
-        steps=_limited_steps(settings, len(train), report),
+        steps=settings.steps,
         extent=extent,
         sh_degree=sh_degree,
         n_start=min(len(start), cap.splats),
@@ -120,18 +123,11 @@ def _warn_of_small_photographs(
         )
 
 
-def _limited_steps(settings: TrainSettings, views: int, report: Report) -> int:
-    """The steps of a run on so many training views; warns if they are fewer than requested."""
-    most = settings.steps_per_view * views
-    if not most or settings.steps <= most:
+def _steps(settings: TrainSettings, views: int) -> int:
+    """The steps of a run on so many training views."""
+    if settings.steps or settings.splats is not None:
         return settings.steps
-    report.warn(
-        "train-steps-limited",
-        f"Training makes {most:,} steps instead of {settings.steps:,}: {settings.steps_per_view} "
-        f"for each of {counted(views, 'training view')}. More would fit these views alone; "
-        "--steps-per-view 0 makes them all.",
-    )
-    return most
+    return min(settings.steps_per_view * views or PUBLISHED_STEPS, PUBLISHED_STEPS)
 
 
 def _on_the_host(backend: str, report: Report) -> str:

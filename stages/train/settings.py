@@ -15,15 +15,17 @@ from stages.raster.backends import backend_setting
 @dataclass(frozen=True)
 class TrainSettings:
     steps: int = setting(
-        7000,
-        "Training steps, with one photograph each; 0, the default of --splats: none.",
+        0,
+        "Training steps, with one photograph each. 0: --steps-per-view for each training view, at "
+        "most 30,000; with --splats none.",
         panel="Quality and time",
         min=0,
         max=1_000_000,
     )
     steps_per_view: int = setting(
         800,
-        "Training steps for each training view, at most: more fit these views alone. 0: no limit.",
+        "Training steps for each training view where --steps does not give their number, and at "
+        "most where --seconds does. 0: no limit.",
         panel="Advanced",
         min=0,
         max=1_000_000,
@@ -118,13 +120,13 @@ class TrainSettings:
 
 PRESETS: dict[str, TrainSettings] = {
     "preview": TrainSettings(steps=2000, train_side=480, sh_degree=1, max_splats=60_000),
-    "standard": TrainSettings(steps=7000, train_side=800, sh_degree=2, max_splats=250_000),
-    "best": TrainSettings(steps=30_000, train_side=1600, sh_degree=3),
+    "standard": TrainSettings(steps_per_view=150, train_side=800, sh_degree=2, max_splats=250_000),
+    "best": TrainSettings(steps_per_view=800, train_side=1600, sh_degree=3),
 }
 
 STAGE = Stage(
     "train",
-    version=37,
+    version=38,
     reads=("sfm", "seed"),
     settings_type=TrainSettings,
     **in_module("stages.train.stage"),

@@ -125,6 +125,8 @@ def _report_task(task: TrainingTask, settings: TrainSettings, report: Report) ->
     report.metric("device", report.device)
     report.metric("unavailable_backends", unavailable_backends(settings.backend))
     report.metric("training_views", len(task.views))
+    cameras = (view.levels[-1].camera for view in task.views)
+    report.metric("side_px", max(max(camera.width, camera.height) for camera in cameras))
     report.metric("held_out_views", len(task.held_out))
 
 

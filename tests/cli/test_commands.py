@@ -422,7 +422,7 @@ def test_a_split_that_the_camera_file_has_not_is_refused_before_anything_is_made
 
 
 def test_command_line_errors_are_json_with_json(splat) -> None:
-    for words in (["--steps", "0"], ["--stepz", "0"]):
+    for words in (["--steps", "-1"], ["--stepz", "0"]):
         (event,) = events(splat("process", "photos", "--json", *words))
         assert (event["event"], event["family"]) == ("error", 2)
 
@@ -432,11 +432,11 @@ def test_training_that_goes_on_says_which_settings_it_keeps(splat) -> None:
     assert "Training:" not in fresh.stderr
     again = splat("train", "--steps", "7000")
     assert (
-        "Training: steps 7,000 (as given); train side 480, SH degree 1, max splats 60,000 "
-        "(as recorded in the run)." in again.stderr
+        "Training: steps 7,000 (as given); steps per view 800, train side 480, SH degree 1, "
+        "max splats 60,000 (as recorded in the run)." in again.stderr
     )
     other = splat("process", "--preset", "standard").stderr
-    assert "steps 7,000, train side 800, SH degree 2, max splats 250,000 (preset stan" in other
+    assert "Training: steps per view 150, train side 800, SH degree 2, max splats 250," in other
 
 
 def test_naming_the_photographs_again_keeps_earlier_options(splat) -> None:

@@ -22,7 +22,7 @@ TARGETS = {
     "chair": "120 s, 36.0 dB",
     "mic": "120 s, 36.5 dB",
 }
-LONG = ("--steps", "30000", "--steps-per-view", "0", "--sh-degree", "3")
+LONG = ("--steps", "30000", "--sh-degree", "3")
 TOY = ("--steps", "4", "--train-side", "16", "--max-splats", "20")
 
 

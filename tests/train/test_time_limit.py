@@ -10,7 +10,13 @@ from stages.train.conversion import model_of
 from stages.train.density import AdaptiveDensity, gradient_threshold
 from stages.train.hooks import Densification, step_hooks
 from stages.train.optimiser import LearningRates
-from stages.train.schedule import RATE_DECAY_END, RATES_POWER, SCALES, Schedule
+from stages.train.schedule import (
+    PUBLISHED_STEPS,
+    RATE_DECAY_END,
+    RATES_POWER,
+    SCALES,
+    Schedule,
+)
 from stages.train.settings import TrainSettings
 from stages.train.time_limit import TimeLimit
 from tests.scenes import camera, cloud
@@ -63,17 +69,33 @@ def test_a_time_limit_plans_no_more_steps_than_the_training_views_allow():
     assert plan.share(800) == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize(
-    ("steps", "per_view", "wanted"), [(500, 100, 400), (400, 100, 400), (500, 0, 500)]
-)
-def test_each_training_view_takes_a_bounded_number_of_steps(tmp_path, steps, per_view, wanted):
-    scene, report = small_scene(tmp_path, views=5), Report()  # one of them is held out
-    settings = TrainSettings(steps=steps, steps_per_view=per_view, max_splats=100)
-    made = make_trainer(scene.reconstruction, scene.splats, settings, tmp_path, report)
-    assert made.schedule.steps == wanted
-    limited = [text for code, text in report.warnings if code == "train-steps-limited"]
-    assert len(limited) == (wanted < steps)
-    assert all("400 steps instead of 500" in text for text in limited)
+def steps_of(tmp_path, views, **settings):
+    """The number of steps that a run on so many photographs plans."""
+    tmp_path.mkdir()
+    scene = small_scene(tmp_path, views=views)
+    made = make_trainer(
+        *(scene.reconstruction, scene.splats, TrainSettings(max_splats=100, **settings)),
+        *(tmp_path, Report()),
+    )
+    return made.schedule.steps, made.task.most_steps
+
+
+def test_each_training_view_takes_its_steps(tmp_path):
+    """One of five photographs is held out."""
+    assert steps_of(tmp_path / "a", 5, steps_per_view=100) == (400, 400)
+    assert steps_of(tmp_path / "b", 5, steps_per_view=0) == (PUBLISHED_STEPS, 0)
+    assert steps_of(tmp_path / "c", 5, steps_per_view=10_000) == (PUBLISHED_STEPS, 40_000)
+
+
+def test_more_photographs_never_take_fewer_steps(tmp_path):
+    numbers = (3, 4, 8, 9)
+    made = [steps_of(tmp_path / str(n), n, steps_per_view=100)[0] for n in numbers]
+    assert made == sorted(made)
+
+
+def test_a_given_number_of_steps_is_made(tmp_path):
+    assert steps_of(tmp_path / "a", 5, steps=500, steps_per_view=100) == (500, 500)
+    assert steps_of(tmp_path / "b", 5, steps=300, steps_per_view=100) == (300, 400)
 
 
 def test_steps_that_take_a_second_each_still_end_in_time():

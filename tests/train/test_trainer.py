@@ -444,6 +444,7 @@ def test_a_run_that_another_backend_goes_on_with_says_so(tmp_path):
     assert report.metrics["trained_by"] == "cpu (cpu) to step 3, then reference (cpu)"
     assert "then reference" in dict(report.warnings)["train-several-backends"]
     line = headline(cast(Any, SimpleNamespace(stage="train", metrics=report.metrics)))
+    assert f"steps 6, side 24 px, splats {report.metrics['splats']}" in line
     assert "trained by cpu (cpu) to step 3" in line
     assert "train-several-backends" not in dict(trained("cpu").warnings)
 
