@@ -198,7 +198,7 @@ def presets() -> str:
     for name, preset in PRESETS.items():
         cap = f"{preset.max_splats:,}" if preset.max_splats else "by memory and photographs"
         size = f"{preset.train_side} px"
-        steps = f"{preset.steps:,}" if preset.steps else f"{preset.steps_per_view} a training view"
+        steps = f"{preset.steps:,}" if preset.steps else f"1,500 and {preset.steps_per_view} a view"
         rows.append((f"`{name}`", steps, size, str(preset.sh_degree), cap))
     return _table(("`--preset`", "steps", "size", "SH degree", "splats, at most"), rows)
 

@@ -14,6 +14,7 @@ from splatcli.app import ENTRIES, loaded
 from stages.base.distribution import VERSION
 from stages.formats.format_table import TABLE
 from stages.run.stages import STAGE_NAMES
+from stages.train.build import FIRST_STEPS
 from stages.train.settings import PRESETS
 from tests.docs_commands import bash_lines, inline_commands, splat_commands
 from tests.docs_picture import EVERYWHERE, PICTURE, Drawing, imports, reached_from
@@ -89,9 +90,9 @@ def test_presets_are_those_of_the_code(page: str) -> None:
     text = (ROOT / page).read_text(encoding="utf-8").replace(",", "")
     for name, preset in PRESETS.items():
         (row,) = [line for line in text.splitlines() if re.match(rf"\| `{name}`.*steps.* at", line)]
-        steps = preset.steps or preset.steps_per_view
-        view = "" if preset.steps else " a training view"
-        assert f"{steps} steps{view} at {preset.train_side} px" in row
+        views = f"{FIRST_STEPS} steps and {preset.steps_per_view} a training view"
+        steps = f"{preset.steps} steps" if preset.steps else views
+        assert f"{steps} at {preset.train_side} px" in row
 
 
 def test_readme_names_every_format() -> None:

@@ -27,6 +27,8 @@ from stages.train.settings import TrainSettings
 from stages.train.trainer import Trainer, TrainingTask
 from stages.train.views import load_views
 
+FIRST_STEPS = 1500  # of a run, however few its training views
+
 
 def make_trainer(
     reconstruction: Reconstruction,
@@ -44,8 +46,10 @@ def make_trainer(
     kept, held = split_held_out(reconstruction.views)
     light = corrects_light(reconstruction, settings.light, report)
     train = load_views(reconstruction.folder, kept, settings.train_side, folder, light)
-    settings = replace(settings, steps=_steps(settings, len(train)))
     given = settings.splats is not None
+    most_steps = _most_steps(settings, len(train))
+    if not settings.steps and not given:
+        settings = replace(settings, steps=most_steps)
     antialias = start.draw_settings.antialias if given else settings.antialias
     sh_degree = max(settings.sh_degree if settings.steps else 0, start.sh_degree)
     draw_settings = draw_settings_of(reconstruction.views, settings.train_side, light, antialias)
@@ -67,8 +71,7 @@ def make_trainer(
         any_background=settings.background == "any",
         backend=backend,
         seconds=settings.seconds and max(settings.seconds - (time.monotonic() - began), 1.0),
-        most_steps=settings.steps_per_view
-        and max(settings.steps, settings.steps_per_view * len(train)),
+        most_steps=max(settings.steps, most_steps),
         within=settings.within,
     )
     schedule = Schedule(
@@ -123,11 +126,9 @@ def _warn_of_small_photographs(
         )
 
 
-def _steps(settings: TrainSettings, views: int) -> int:
-    """The steps of a run on so many training views."""
-    if settings.steps or settings.splats is not None:
-        return settings.steps
-    return min(settings.steps_per_view * views or PUBLISHED_STEPS, PUBLISHED_STEPS)
+def _most_steps(settings: TrainSettings, views: int) -> int:
+    """How many steps so many training views are worth."""
+    return min(FIRST_STEPS + settings.steps_per_view * views, PUBLISHED_STEPS)
 
 
 def _on_the_host(backend: str, report: Report) -> str:

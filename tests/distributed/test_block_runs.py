@@ -15,10 +15,12 @@ from stages.base.errors import Interrupted, SplatError
 from stages.distributed import blocks, partition
 from stages.distributed.tasks import SerialExecutor, TaskResult
 from stages.run.listener import Listener
+from stages.run.manifest import Manifest
 from stages.run.pipeline import Pipeline
 from stages.run.stages import STAGE_NAMES, STAGE_OF
 from stages.scene import save_splats, split_held_out
 from stages.sfm.reconstruction_files import save_reconstruction
+from stages.train import build
 from tests.small_scene import small_scene
 
 pytestmark = pytest.mark.timeout(300)  # the first to train compiles kernels
@@ -168,6 +170,18 @@ def test_a_block_that_no_photograph_shows_is_the_coarse_model_s(
     folders = [row["run_folder"] for row in manifest.metrics["blocks"]]
     assert folders == ["blocks/1", "blocks/coarse"]
     assert "train-blocks-unseen" in [code for code, _ in manifest.warnings]
+
+
+def test_training_views_decide_the_steps_of_a_block_and_of_the_coarse_model(
+    tmp_path, photos, monkeypatch
+) -> None:
+    """A third of the steps a view makes the coarse model."""
+    monkeypatch.setattr(build, "FIRST_STEPS", 9)
+    trained(tmp_path / "run", photos, blocks="2", steps=0, steps_per_view=6)
+    for name, per_view in (("coarse", 2), ("1", 6), ("2", 6)):
+        manifest = Manifest.read(tmp_path / "run" / "blocks" / name / "4-train")
+        assert manifest is not None
+        assert manifest.metrics["steps"] == 9 + per_view * manifest.metrics["training_views"]
 
 
 def test_blocks_need_a_number_of_splats_to_share(tmp_path, photos) -> None:
