@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import functools
 import importlib.util
+import os
 import re
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -72,12 +73,15 @@ def _within(name: str, bound: float) -> float:
     return float(found)
 
 
+@functools.cache
 def why_unavailable() -> str:
     """Why "auto" does not choose this backend on this machine; "" if it does."""
-    fault = missing()
-    if not fault and _adapter().info["adapter_type"] == "CPU":
-        return f"its adapter is a program on the CPU ({_adapter().info['device']})"
-    return fault
+    if wgpu is not None:
+        with suppress(Exception):  # `missing` says what fails
+            info = _adapter().info
+            if info["adapter_type"] == "CPU":  # known without a device, which takes a second there
+                return f"its adapter is a program on the CPU ({info['device']})"
+    return missing()
 
 
 @functools.cache
@@ -119,7 +123,22 @@ def _adapter() -> Any:
     if importlib.util.find_spec("triton"):
         # loaded after the LLVM of Mesa's drivers, Triton's crashes; the other order works
         importlib.import_module("triton")
-    return wgpu.gpu.request_adapter_sync(power_preference=wgpu.PowerPreference.high_performance)
+    with _drivers_silent():
+        return wgpu.gpu.request_adapter_sync(power_preference=wgpu.PowerPreference.high_performance)
+
+
+@contextmanager
+def _drivers_silent() -> Iterator[None]:
+    """Without what drivers write to standard error while they are looked for: those that cannot
+    serve complain, and no user can do anything about it."""
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
 
 
 @functools.cache
