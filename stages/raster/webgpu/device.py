@@ -73,11 +73,10 @@ def _within(name: str, bound: float) -> float:
     return float(found)
 
 
-@functools.cache
 def why_unavailable() -> str:
     """Why "auto" does not choose this backend on this machine; "" if it does."""
     if wgpu is not None:
-        with suppress(Exception):  # `missing` says what fails
+        with suppress(Exception):  # `missing` says which
             info = _adapter().info
             if info["adapter_type"] == "CPU":  # known without a device, which takes a second there
                 return f"its adapter is a program on the CPU ({info['device']})"
