@@ -27,7 +27,7 @@ from stages.raster.kernels import cache
 
 _LITTLE_MEMORY_MIB = 2048.0
 _LITTLE_DISK_BYTES = 2_000_000_000
-_BACKEND_ADVICE = "docs/guide/gpu.md says what it takes."
+_BACKEND_ADVICE = "docs/guide/{page}.md says what it takes."
 # CPU minutes of a whole run of the sample, 24 photographs of 640 px, with AVX-512; see README.
 _CPU_MINUTES = {"preview": 3.0, "standard": 14.0}
 _WITHOUT_AVX512 = 2.0
@@ -163,7 +163,8 @@ def _backend(backend: Backend) -> Check:
     label = f"backend {backend.name}"
     try:
         if why := backend.why_unavailable():
-            return Check(label, f"not chosen: {why}", advice=_BACKEND_ADVICE)
+            advice = _BACKEND_ADVICE.format(page=backend.name)
+            return Check(label, f"not chosen: {why}.", advice=advice)
         backend.create()
     except Exception as error:
         return Check(label, f"not present ({reason_of(error)})", ok=False)
