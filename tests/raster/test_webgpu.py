@@ -15,7 +15,7 @@ from stages.raster.webgpu import device
 from stages.raster.webgpu.rasteriser import WebGpuRasteriser
 from tests.extremes.gpu import on_gpu
 from tests.extremes.table import ROWS, measured
-from tests.raster import test_extremes as hostile
+from tests.raster import hostile_values as hostile
 from tests.scenes import PARAMETERS, camera, cloud, exact_gradients, gradients, relative
 from tests.tolerances import FLOAT32_GRADIENT, FLOAT32_IMAGE
 
@@ -174,7 +174,7 @@ def test_every_number_of_the_table_is_within_its_bound(row):
 @pytest.mark.slow
 @pytest.mark.parametrize("slot", PARAMETERS)
 def test_hostile_values_corrupt_nothing_else(slot):
-    """See `tests.raster.test_extremes`."""
+    """See `hostile_values.check_hostile`."""
     for component in range(hostile.components(slot)):
         for value in (*hostile.EXTREMES, *hostile.near_threshold(slot), *hostile.NOT_NUMBERS):
             a, b = (

@@ -12,43 +12,25 @@ import torch
 
 pytest.importorskip("triton")
 
-from stages.raster.definition import MemoryFull, RasterSettings, splat_arrays
+from stages.raster.definition import MemoryFull, RasterSettings
 from stages.raster.gpu import device
 from stages.raster.gpu.rasteriser import GpuRasteriser
 from stages.raster.reference_rasteriser import ReferenceRasteriser
 from stages.scene import IGNORE, TRANSPARENT
 from stages.train.dropout import Dropout
-from stages.train.loss import channel_means
-from stages.train.optimiser import LearningRates, Model, empty_model, new_model
+from stages.train.optimiser import LearningRates, empty_model
 from stages.train.steps import gpu as gpu_step
 from stages.train.steps.gpu import GpuStep, image_loss
 from stages.train.steps.reference import ReferenceStep, reference_loss
 from stages.train.steps.step import StepInput
-from stages.train.views import Level
-from tests.scenes import camera, cloud
+from tests.scenes import camera
 from tests.tolerances import LOSS_GRADIENT
+from tests.train.steps.models import level, masked, start
 
 pytestmark = pytest.mark.gpu
 RATES = LearningRates(means=1e-3)
 SETTINGS = RasterSettings(near=0.1, sh_degree=1)
 WAITS = ("item", "cpu", "numpy", "tolist", "nonzero", "__bool__", "__int__", "__float__")
-
-
-def level(size=(40, 30), seed=0) -> Level:
-    pixels = np.random.default_rng(seed).integers(0, 256, (3, size[1], size[0])).astype(np.uint8)
-    return Level(camera(*size), pixels, channel_means(pixels))
-
-
-def masked(outside: str, light: tuple[float, float, float] | None) -> Level:
-    plain = level()
-    mask = np.where(np.arange(40) < 25, 255, 0).astype(np.uint8)[None] * np.ones((30, 1), np.uint8)
-    return Level(plain.camera, plain.pixels, plain.means, mask, outside, light)
-
-
-def start(n=20) -> Model:
-    found = new_model(*(a.copy() for a in splat_arrays(cloud(n, 40, 30, degree=1, seed=4))))
-    found.distances[:] = np.linspace(0.1, 5.0, n)
-    return found
 
 
 def stepper(lag: int | None = None) -> GpuStep:

@@ -21,8 +21,7 @@ from stages.train.steps.reference import ReferenceStep
 from stages.train.steps.step import StepInput
 from stages.train.steps.webgpu import WebGpuStep
 from tests.scenes import camera
-from tests.train.steps import test_device_model as rules
-from tests.train.steps.test_gpu import level, masked, start
+from tests.train.steps.models import EVENTS, level, masked, start, used_model
 
 pytestmark = pytest.mark.skipif(bool(device.missing()), reason=device.missing())
 RATES = LearningRates(means=1e-3, extent=2.0)
@@ -111,11 +110,11 @@ def test_lists_without_room_leave_the_model_as_it_was_and_get_room():
     assert (made.model().steps > before.steps).any()
 
 
-@pytest.mark.parametrize("event", rules.EVENTS)
+@pytest.mark.parametrize("event", EVENTS)
 def test_what_rules_leave_is_what_they_leave_on_the_host(event):
-    made = stepper(model=rules.start())
+    made = stepper(model=used_model())
     made._on_host = None  # so that it comes from the device
-    wanted, there = rules.EVENTS[event](rules.start()), rules.EVENTS[event](made.model())
+    wanted, there = EVENTS[event](used_model()), EVENTS[event](made.model())
     assert isinstance(there, DeviceModel)
     made.load(there)
     for found in (there.on_host(), made.model().on_host()):
