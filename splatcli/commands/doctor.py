@@ -29,7 +29,7 @@ _LITTLE_MEMORY_MIB = 2048.0
 _LITTLE_DISK_BYTES = 2_000_000_000
 _BACKEND_ADVICE = "docs/guide/{page}.md says what it takes."
 # CPU minutes of a whole run of the sample, 24 photographs of 640 px, with AVX-512; see README.
-_CPU_MINUTES = {"preview": 3.0, "standard": 14.0}
+_CPU_MINUTES = {"preview": 3.0, "standard": 11.0}
 _WITHOUT_AVX512 = 2.0
 _VIDEO_CODECS = ("h264", "hevc", "av1", "vp9", "vp8", "mpeg4", "prores", "mjpeg", "gif")
 
