@@ -164,7 +164,7 @@ def _backend(backend: Backend) -> Check:
     try:
         if why := backend.why_unavailable():
             advice = _BACKEND_ADVICE.format(page=backend.name)
-            return Check(label, f"not chosen: {why}.", advice=advice)
+            return Check(label, f"not chosen: {why.rstrip('.')}.", advice=advice)
         backend.create()
     except Exception as error:
         return Check(label, f"not present ({reason_of(error)})", ok=False)

@@ -32,7 +32,6 @@ except (ImportError, OSError, RuntimeError) as _error:  # not installed, or no l
 
 FOLDER = Path(__file__).parent
 MOST_GROUPS = 65535  # in one dimension of a dispatch
-BYTES_A_SPLAT = 2200  # of training, degree 3: an estimate
 _SLOT, _SLOTS = 256, 512  # bytes for the numbers of a dispatch; dispatches in one submission
 _TOO_LARGE = re.compile("[Bb]uffer (size|binding)")  # of what wgpu says
 _CONSTANTS = (
@@ -58,8 +57,12 @@ class Kernel:
         """The whole text."""
         shared = [(name, _within(name, getattr(definition, name))) for name in _CONSTANTS]
         lines = [f"const {name} = {number!r};" for name, number in (*shared, *self.constants)]
-        text = self.file.read_text()
-        text = re.sub(r"^//include (\S+)$", lambda m: (FOLDER / m[1]).read_text(), text, flags=re.M)
+        text = re.sub(
+            r"^//include (\S+)$",
+            lambda found: (FOLDER / found[1]).read_text(encoding="utf-8"),
+            self.file.read_text(encoding="utf-8"),
+            flags=re.M,
+        )
         return "\n".join([*lines, text])
 
 
