@@ -7,6 +7,7 @@ import os
 import platform
 import shutil
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -163,6 +164,8 @@ def _backend(backend: Backend) -> Check:
     label = f"backend {backend.name}"
     try:
         if why := backend.why_unavailable():
+            with suppress(Exception):  # a software adapter that --backend would take
+                why = f"{why}; by name it runs on {backend.describe()}"
             advice = _BACKEND_ADVICE.format(page=backend.name)
             return Check(label, f"not chosen: {why.rstrip('.')}.", advice=advice)
         backend.create()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -70,6 +71,20 @@ def test_auto_takes_webgpu_on_hardware_alone(kind, fault, chosen, monkeypatch) -
     info = {"adapter_type": kind, "device": "this one"}
     monkeypatch.setattr(gpu, "missing", lambda: "no card")
     monkeypatch.setattr(webgpu, "missing", lambda: fault)
+    monkeypatch.setattr(webgpu, "_may_have_card", lambda: True)
     monkeypatch.setattr(webgpu, "_adapter", lambda: SimpleNamespace(info=info))
     assert backends.backend_of(AUTO).name == chosen
     assert ("this one" in backends.unavailable_backends(AUTO).get("webgpu", "")) == (kind == "CPU")
+
+
+def test_auto_looks_for_no_adapter_where_linux_shows_no_card(monkeypatch) -> None:
+    """It would take a second of every command."""
+    looked: list[str] = []
+    monkeypatch.setattr(gpu, "missing", lambda: "no card")
+    monkeypatch.setattr(webgpu, "wgpu", SimpleNamespace())
+    monkeypatch.setattr(webgpu, "_CARDS", ("no/such/card*",))
+    monkeypatch.setattr(webgpu, "_adapter", lambda: looked.append("an adapter"))
+    monkeypatch.setattr(sys, "platform", "linux")
+    assert backends.backend_of(AUTO).name == "cpu"
+    assert "no/such/card*" in backends.unavailable_backends(AUTO)["webgpu"]
+    assert not looked

@@ -11,6 +11,7 @@ import functools
 import importlib.util
 import os
 import re
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -33,6 +34,8 @@ except (ImportError, OSError, RuntimeError) as _error:  # not installed, or no l
 FOLDER = Path(__file__).parent
 MOST_GROUPS = 65535  # in one dimension of a dispatch
 _SLOT, _SLOTS = 256, 512  # bytes for the numbers of a dispatch; dispatches in one submission
+# Where Linux shows a card to programs: a render node, NVIDIA's driver, Windows' one below WSL.
+_CARDS = ("dri/renderD*", "nvidiactl", "dxg")
 _TOO_LARGE = re.compile("[Bb]uffer (size|binding)")  # of what wgpu says
 _CONSTANTS = (
     *("ALPHA_MIN", "ALPHA_MAX", "TRANSMITTANCE_MIN", "LOG_SCALE_MAX", "SCALE_MAX", "COLOUR_MAX"),
@@ -79,11 +82,19 @@ def _within(name: str, bound: float) -> float:
 def why_unavailable() -> str:
     """Why "auto" does not choose this backend on this machine; "" if it does."""
     if wgpu is not None:
+        if not _may_have_card():
+            return f"Linux shows no GPU (in /dev: {', '.join(_CARDS)})"
         with suppress(Exception):  # `missing` says which
             info = _adapter().info
             if info["adapter_type"] == "CPU":  # known without a device, which takes a second there
                 return f"its adapter is a program on the CPU ({info['device']})"
     return missing()
+
+
+def _may_have_card() -> bool:
+    """Whether there may be a GPU. Looking for adapters takes a second, in each process, on machines
+    that have software ones alone."""
+    return sys.platform != "linux" or any(any(Path("/dev").glob(card)) for card in _CARDS)
 
 
 @functools.cache
