@@ -41,7 +41,7 @@ def without_compensation(splats: Splats, cameras: Sequence[Camera]) -> Splats:
 def mean_compensation(splats: Splats, cameras: Sequence[Camera]) -> NDArray[np.float64]:
     """[N] factor of each splat's opacity, averaged over the cameras whose picture holds its mean;
     if there is no such camera, over those that the splat is in front of; 1 if no camera is left."""
-    from stages.raster.reference import parameters_of, project  # it loads torch
+    from stages.raster.reference import footprints, parameters_of  # it loads torch
 
     opaque = replace(splats, opacity_logits=np.full(len(splats), _OPAQUE, np.float32))
     settings, parameters = raster_settings_of(splats.with_antialias(True)), parameters_of(opaque)
@@ -50,7 +50,7 @@ def mean_compensation(splats: Splats, cameras: Sequence[Camera]) -> NDArray[np.f
         pixels, z = camera.project(splats.means)
         inside = ((pixels >= 0) & (pixels <= (camera.width, camera.height))).all(axis=1)
         weight = np.where(z > settings.near, np.where(inside, 1.0, _OUTSIDE), 0.0)
-        found = project(parameters, camera, settings)  # without factors below 1/255
+        found = footprints(parameters, camera, settings)  # without factors below 1/255
         factors = np.zeros(len(splats))
         factors[found.index.numpy()] = found.opacities.detach().numpy()
         total += weight * factors

@@ -110,7 +110,7 @@ def colours(p: Parameters, camera_centre: Tensor, degree: int) -> Tensor:
 
 @dataclass(frozen=True)
 class Projected:
-    """Footprints of M splats, in blending order.
+    """Footprints of M splats; those of `project` are in blending order.
 
     index [M] rows of the input. means2d [M, 2] px. a, b, c [M]: cov2d = [[a, b], [b, c]], px^2,
     with its determinant det [M]. opacities [M], compensation included. depths [M].
@@ -124,6 +124,10 @@ class Projected:
     det: Tensor
     opacities: Tensor
     depths: Tensor
+
+    def rows(self, rows: Tensor) -> Projected:
+        """The footprints of these rows."""
+        return Projected(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
 
 def apply_smoothing(p: Parameters, widths: Tensor) -> tuple[Tensor, Tensor]:
@@ -141,6 +145,14 @@ def project(
     p: Parameters, camera: Camera, settings: RasterSettings, smoothing: Tensor | None = None
 ) -> Projected:
     """Footprints of the splats in front of the near plane, nearest first."""
+    found = footprints(p, camera, settings, smoothing)
+    return found.rows(_order(p.rows(found.index), found.depths))
+
+
+def footprints(
+    p: Parameters, camera: Camera, settings: RasterSettings, smoothing: Tensor | None = None
+) -> Projected:
+    """As `project`, in the order of the splats."""
     like: dict[str, Any] = {"dtype": p.means.dtype, "device": p.means.device}
     world_to_camera = torch.tensor(camera.world_to_camera, **like)
     rotation, translation = world_to_camera[:3, :3], world_to_camera[:3, 3]
@@ -172,11 +184,7 @@ def project(
         least = max(1e-60, torch.finfo(minors.dtype).tiny)
         opacities = opacities * (minors.clamp_min(least) / det).sqrt()
     seen = (opacities >= ALPHA_MIN).nonzero()[:, 0]
-    order = seen[_order(p.rows(seen), z[seen])]
-    return Projected(
-        index[order],
-        *(t[order] for t in (means2d, a0 + e, b, c0 + e, det, opacities, z)),
-    )
+    return Projected(index, means2d, a0 + e, b, c0 + e, det, opacities, z).rows(seen)
 
 
 def _order(p: Parameters, z: Tensor) -> Tensor:
@@ -194,7 +202,7 @@ def alphas_at(projected: Projected, rows: Tensor, pixels: Tensor) -> Tensor:
 
     The exponent in Cholesky form: never negative, whatever the rounding.
     """
-    q = Projected(*(getattr(projected, f)[rows] for f in projected.__dataclass_fields__))
+    q = projected.rows(rows)
     dx = pixels[None, :, 0] - q.means2d[:, None, 0]
     dy = pixels[None, :, 1] - q.means2d[:, None, 1]
     wide = (q.a >= q.c)[:, None]
