@@ -21,7 +21,7 @@ _HEADLINES = {
     "train": ("steps", "side_px", "splats", "trained_by"),
     # Later stages measure at sizes of their own: it cannot be compared with that of training.
     "prune": ("splats", "floaters_removed", "psnr_change_db"),
-    "quantise": ("sh_degree", "kept_mib"),
+    "quantise": ("sh_degree", "kept_mib", "plain_drawing_change_db"),
     "export": ("files", "splats"),
 }
 _SMALLER = {"mean at half size": "psnr_half_db", "mean at quarter size": "psnr_quarter_db"}

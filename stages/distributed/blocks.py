@@ -122,7 +122,8 @@ class _BlockTraining:
         trained = self._merge(parts, cells, seam_views, draw_settings, len(training))
         verdict = self._evaluate(trained.splats, held, folder)
         wrong = verdict.grade == WRONG and self.whole.contradicted
-        trained = replace(trained, contradicted=wrong)
+        steps = max(self._trained(name).steps for name in {*folders})
+        trained = replace(trained, contradicted=wrong, steps=steps)
         save(folder, trained)
         self.report.metric("training_views", len(training))
         self.report.metric("held_out_views", len(held))

@@ -19,10 +19,19 @@ from stages.formats.values import drop_undrawable
 from stages.quantise.rounding import finetune_to_rounding, write_and_read
 from stages.quantise.settings import QuantiseSettings
 from stages.raster.compensation import without_compensation
-from stages.scene import QuantisedSplats, Reconstruction, Splats, split_held_out, training_extent
+from stages.scene import (
+    QuantisedSplats,
+    Reconstruction,
+    Splats,
+    TrainedSplats,
+    split_held_out,
+    training_extent,
+)
 from stages.train.finetune import FineTuner
 
 PLAIN_RATES = 3.0, 0.4  # with them 200 steps are as good as 300 with the usual ones
+# What longer training has fitted more closely takes longer to fit again.
+FEWEST_PLAIN_STEPS, TRAINING_PER_PLAIN_STEP = 200, 10
 
 
 @dataclass(frozen=True)
@@ -31,9 +40,8 @@ class FormatFinetuning:
 
     Attributes:
         rounding: fine-tunes to the rounding of formats.
-        plain: fine-tunes to plain drawing, on views of the size of training and half of it. In a
-            plain viewer the result is as good as splats that were trained for it at the size of
-            training, and better from farther away.
+        plain: fine-tunes to plain drawing, on views of the size of training and half of it.
+        plain_steps: how many steps it makes.
         deciding_views: training views that decide whether fine-tuning to rounding has helped.
         view_counts: [N] in how many views each splat is visible.
         settings, report: of the stage.
@@ -41,6 +49,7 @@ class FormatFinetuning:
 
     rounding: FineTuner
     plain: FineTuner
+    plain_steps: int
     deciding_views: Sequence[EvaluationView]
     view_counts: NDArray[np.int32]
     settings: QuantiseSettings
@@ -51,7 +60,7 @@ class FormatFinetuning:
         cls,
         splats: Splats,
         reconstruction: Reconstruction,
-        dropout: bool,
+        trained: TrainedSplats,
         settings: QuantiseSettings,
         deciding_views: Sequence[EvaluationView],
         report: Report,
@@ -61,12 +70,16 @@ class FormatFinetuning:
         Args:
             splats: as trained and pruned.
             reconstruction: whose training views are used.
-            dropout: whether training used dropout.
+            trained: the result of training: whether it used dropout, and its steps.
             settings: of the stage.
             deciding_views: as in the class.
             report: says before each step whether to stop.
         """
         splats, backend = drop_undrawable(splats)[0], settings.backend
+        dropout = trained.dropout
+        plain_steps = settings.plain_steps or max(
+            FEWEST_PLAIN_STEPS, trained.steps // TRAINING_PER_PLAIN_STEP
+        )
         training = split_held_out(reconstruction.views)[0]
         views = load_evaluation_views(
             reconstruction.folder, training, splats.draw_settings, report.stop_requested
@@ -77,7 +90,7 @@ class FormatFinetuning:
         extent = training_extent(reconstruction)
         rounding = FineTuner(views, extent, backend, report, dropout)
         plain = FineTuner(views, extent, backend, report, dropout, True, PLAIN_RATES)
-        return cls(rounding, plain, deciding_views, view_counts, settings, report)
+        return cls(rounding, plain, plain_steps, deciding_views, view_counts, settings, report)
 
     def to_plain_drawing(self, splats: Splats, earlier: Splats | None = None) -> Splats | None:
         """The splats for formats that are drawn without opacity compensation; None if no such
@@ -92,7 +105,7 @@ class FormatFinetuning:
             return earlier
         self.report.progress(0, 1, "fine-tuning to plain drawing")
         found = without_compensation(drop_undrawable(splats)[0], self.plain.cameras)
-        return self.plain.finetune(found, self.settings.plain_steps, self.view_counts)
+        return self.plain.finetune(found, self.plain_steps, self.view_counts)
 
     def to_rounding(
         self,

@@ -41,8 +41,9 @@ class QuantiseSettings:
     )
     drawing: str = drawing_setting()
     plain_steps: int = setting(
-        200,
-        "Steps of fine-tuning of antialiased splats for formats that are drawn plainly.",
+        0,
+        "Steps of fine-tuning of antialiased splats for formats that are drawn plainly. 0: a tenth "
+        "of the steps of training, and at least 200.",
         min=0,
         max=100_000,
     )
@@ -63,7 +64,7 @@ class QuantiseSettings:
 
 STAGE = Stage(
     "quantise",
-    version=17,
+    version=18,
     reads=("sfm", "train", "prune"),
     settings_type=QuantiseSettings,
     adds="formats",

@@ -56,6 +56,8 @@ from stages.scene import (
 
 _DECISIONS, _FLAT, _FINETUNED = "decisions.json", "flat_dc.npy", "finetuned"
 _SOG = "sog"  # the format whose bits are chosen
+_PLAIN_CHANGE = "plain_drawing_change_db"
+_PLAIN_LOSS_DB = 1.0  # at which the report warns
 # Change of colour (of 255) that a splat's higher SH degrees may make and still be dropped, largest
 # first.
 _THRESHOLDS_OF_255 = (8.0, 4.0, 2.0, 1.0, 0.5, 0.25)
@@ -67,11 +69,11 @@ def run(
 ) -> QuantisedSplats:
     """Decide on the splats of inputs["prune"] by training views of inputs["sfm"].
 
-    Metrics: psnr_raw_db, psnr_kept_db, psnr_splat32_db (means over the held-out views, or over
-    the deciding views where none are held out), sh_degree, splats_by_sh_degree, bits (if a .sog is
-    requested), raw_mib, kept_mib; formats: by format that was fine-tuned to, rounded_db and
-    finetuned_db (see `quantise.format_finetuning`). Raises SplatError if a photograph cannot be
-    read, and Interrupted.
+    Metrics: psnr_raw_db, psnr_kept_db, psnr_plain_db, psnr_splat32_db (means over the held-out
+    views, or over the deciding views where none are held out), plain_drawing_change_db, sh_degree,
+    splats_by_sh_degree, bits (if a .sog is requested), raw_mib, kept_mib; formats: by format that
+    was fine-tuned to, rounded_db and finetuned_db (see `quantise.format_finetuning`). Raises
+    SplatError if a photograph cannot be read, and Interrupted.
     """
     splats: Splats = inputs["prune"]
     trained: TrainedSplats = inputs["train"]
@@ -81,9 +83,7 @@ def run(
     kept, by_degree, threshold = (
         earlier.sh if earlier else _choose_sh_degrees(splats, settings, decider)
     )
-    finetuning = FormatFinetuning.of(
-        kept, reconstruction, trained.dropout, settings, decider.views, report
-    )
+    finetuning = FormatFinetuning.of(kept, reconstruction, trained, settings, decider.views, report)
     plain = finetuning.to_plain_drawing(kept, earlier.quantised.plain if earlier else None)
     if earlier and (earlier.quantised.plain is None) != (plain is None):
         earlier = None  # all that follows depends on it
@@ -119,6 +119,14 @@ def _report(figures: Mapping[str, Any], sizes: Mapping[str, Splats], report: Rep
     for name, splats in sizes.items():
         report.metric(name, round(_bytes(splats) / 2**20, 3))
         report.metric("evaluated_side_px", splats.draw_settings.side)
+    lost_db = -figures.get(_PLAIN_CHANGE, 0.0)
+    if lost_db > _PLAIN_LOSS_DB:
+        report.warn(
+            "quantise-plain-drawing",
+            f"Drawn plainly, as most programs draw .ply, .sog, .glb and .usdz, the splats have "
+            f"{lost_db:.1f} dB less than antialiased, as they were trained. `--drawing plain` with "
+            "`splat process` trains them for it; more --plain-steps regain a part.",
+        )
 
 
 @dataclass(frozen=True)
@@ -172,10 +180,14 @@ def _sog_bits(
 def _figures(splats: Splats, quantised: QuantisedSplats, evaluator: _Measure) -> dict[str, object]:
     """The figures of the decision, for the report and for people. splats: before it."""
     kept, plain, row = quantised.splats, quantised.plain, FORMATS["splat"]
+    raw_db, kept_db = evaluator.psnr(splats), evaluator.psnr_at_sizes(kept, "psnr_kept")
+    plain_db = None if plain is None else evaluator.psnr(plain)
+    change = {} if plain_db is None else {_PLAIN_CHANGE: plain_db - kept_db["psnr_kept_db"]}
     return {
-        "psnr_raw_db": evaluator.psnr(splats),
-        **evaluator.psnr_at_sizes(kept, "psnr_kept"),
-        "psnr_plain_db": None if plain is None else evaluator.psnr(plain),
+        "psnr_raw_db": raw_db,
+        **kept_db,
+        "psnr_plain_db": plain_db,
+        **{name: round(value, 3) for name, value in change.items()},
         "psnr_splat32_db": evaluator.psnr(write_and_read(row, splats_to_write(row, quantised))),
         "sh_degree": kept.sh_degree,
         "splats_by_sh_degree": [

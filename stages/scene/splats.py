@@ -128,6 +128,7 @@ class TrainedSplats:
         cameras: where training has refined them; None where it has not.
         contradicted: whether they are wrong because photographs contradict each other.
         masks: of training views that show what moved, which training ignored; by name.
+        steps: how many made them; 0 where another program or an older version did.
     """
 
     splats: Splats
@@ -135,6 +136,7 @@ class TrainedSplats:
     cameras: RefinedCameras | None = None
     contradicted: bool = False
     masks: Mapping[str, Path] = field(default_factory=dict)
+    steps: int = 0
 
 
 @dataclass(frozen=True)

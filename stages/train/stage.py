@@ -82,7 +82,8 @@ def run(
     write_history(trainer.history, folder, report)
     found = report_verdict(splats, held_out, reconstruction, task.backend, report)
     contradicted = found.grade == WRONG and reconstruction.contradicted
-    trained = TrainedSplats(splats, task.dropout, refined, contradicted, masks)
+    steps = trainer.schedule.steps
+    trained = TrainedSplats(splats, task.dropout, refined, contradicted, masks, steps)
     save(folder, trained)
     remove_checkpoint(folder)
     remove_cap(folder)
@@ -196,7 +197,8 @@ def _nothing_left() -> SplatError:
 def save(folder: Path, trained: TrainedSplats) -> None:
     """What `load` reads. Raises SplatError."""
     save_splats(folder, trained.splats)
-    facts: dict[str, Any] = {"dropout": trained.dropout, "contradicted": trained.contradicted}
+    names = "dropout", "contradicted", "steps"
+    facts: dict[str, Any] = {name: getattr(trained, name) for name in names}
     facts["masks"] = {
         name: path.relative_to(folder).as_posix() for name, path in trained.masks.items()
     }
@@ -217,4 +219,5 @@ def load(folder: Path) -> TrainedSplats:
             cameras = RefinedCameras(poses, float(found["focal_factor"]))
         contradicted = bool(facts.get("contradicted"))
         masks = {name: folder / path for name, path in facts.get("masks", {}).items()}
-        return TrainedSplats(splats, bool(facts["dropout"]), cameras, contradicted, masks)
+        dropout, steps = bool(facts["dropout"]), int(facts.get("steps", 0))
+        return TrainedSplats(splats, dropout, cameras, contradicted, masks, steps)

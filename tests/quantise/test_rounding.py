@@ -73,7 +73,7 @@ def quantised(scene: SmallScene, *names: str) -> tuple[QuantisedSplats, dict[str
     plain = QuantisedSplats(scene.splats, vars(FEW))
     settings = QuantiseSettings(rounding_steps=10, backend="cpu")
     finetuning = FormatFinetuning(
-        *(finetuner(scene), finetuner(scene), views(scene), no_counts(scene), settings, Report())
+        *(finetuner(scene), finetuner(scene), 0, views(scene), no_counts(scene), settings, Report())
     )
     found = {name: finetuning.to_rounding_of(FORMATS[name], plain) for name in names}
     finetuned = {name: splats for name, (splats, _) in found.items()}

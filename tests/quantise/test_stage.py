@@ -18,6 +18,7 @@ from stages.evaluate.sh import sufficient_degrees, truncate_sh, truncation_rms
 from stages.formats.format_table import FORMATS
 from stages.formats.sog_quantisation import splats_to_write
 from stages.quantise import stage as quantise
+from stages.quantise.format_finetuning import FormatFinetuning
 from stages.quantise.settings import QuantiseSettings
 from stages.scene import QuantisedSplats, TrainedSplats, dc_to_rgb, split_held_out
 from tests.formats.truth import colour, many_splats
@@ -134,7 +135,40 @@ def test_formats_that_are_drawn_plainly_get_splats_that_were_finetuned_to_it(
     held_out = load_evaluation_views(scene.reconstruction.folder, views, small.draw_settings)
     as_they_are_db = mean_psnr_db(result.splats.with_antialias(False), held_out, "cpu")
     assert metrics["psnr_plain_db"] > as_they_are_db + 1
+    change_db = metrics["psnr_plain_db"] - metrics["psnr_kept_db"]
+    assert metrics["plain_drawing_change_db"] == pytest.approx(change_db, abs=1e-3)
     assert quantise.load(tmp_path).plain is not None
+
+
+@pytest.mark.parametrize(
+    ("trained", "asked", "made"), [(0, 0, 200), (2000, 0, 200), (30000, 0, 3000), (30000, 7, 7)]
+)
+def test_the_longer_training_was_the_longer_splats_are_finetuned_to_plain_drawing(
+    scene: SmallScene, trained: int, asked: int, made: int
+) -> None:
+    training, settings = TrainedSplats(scene.splats, steps=trained), QuantiseSettings()
+    finetuning = FormatFinetuning.of(
+        scene.splats,
+        scene.reconstruction,
+        training,
+        replace(settings, plain_steps=asked),
+        (),
+        Report(),
+    )
+    assert finetuning.plain_steps == made
+
+
+def test_a_large_loss_by_plain_drawing_is_a_warning(
+    scene: SmallScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    splats = scene.splats.with_antialias(True)
+    inputs = {"sfm": scene.reconstruction, "train": TrainedSplats(splats), "prune": splats}
+    settings = QuantiseSettings(formats=("ply",), plain_steps=1, rounding_steps=0)
+    for large_db, warned in ((0.1, ["quantise-plain-drawing"]), (1.0, [])):
+        monkeypatch.setattr(quantise, "_PLAIN_LOSS_DB", large_db)
+        report = Report()
+        quantise.run(inputs, settings, tmp_path, report)
+        assert [code for code, _ in report.warnings] == warned
 
 
 @pytest.mark.parametrize(
