@@ -30,7 +30,7 @@ from stages.scene import (
 from stages.train.finetune import FineTuner
 
 PLAIN_RATES = 3.0, 0.4  # with them 200 steps are as good as 300 with the usual ones
-# What longer training has fitted more closely takes longer to fit again.
+# The longer splats were trained antialiased, the longer they take to adapt.
 FEWEST_PLAIN_STEPS, TRAINING_PER_PLAIN_STEP = 200, 10
 
 
