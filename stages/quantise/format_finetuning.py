@@ -103,9 +103,9 @@ class FormatFinetuning:
             return None
         if earlier is not None:
             return earlier
-        self.report.progress(0, 1, "fine-tuning to plain drawing")
         found = without_compensation(drop_undrawable(splats)[0], self.plain.cameras)
-        return self.plain.finetune(found, self.plain_steps, self.view_counts)
+        doing = "fine-tuning to plain drawing"
+        return self.plain.finetune(found, self.plain_steps, self.view_counts, progress=doing)
 
     def to_rounding(
         self,

@@ -72,6 +72,7 @@ class FineTuner:
         steps: int,
         view_counts: NDArray[np.int32],
         frozen: Collection[str] = (),
+        progress: str = "",
     ) -> Splats:
         """The same splats after more steps; SH coefficients above each splat's degree stay zero.
 
@@ -80,6 +81,7 @@ class FineTuner:
             steps: how many; 0 returns `splats`.
             view_counts: [N] in how many views each splat is visible.
             frozen: parameters that keep their exact values, by the names of `LearningRates`.
+            progress: what the report says is done, with the number of the step; nothing if empty.
 
         Raises Interrupted when the report asks to stop.
         """
@@ -93,6 +95,8 @@ class FineTuner:
         for number in range(steps):
             if self.report.stop_requested.is_set():
                 raise Interrupted("stopped while fine-tuning")
+            if progress:
+                self.report.progress(number, steps, progress)
             done = number / steps
             rates = LearningRates().scaled(
                 MEANS_LR * self.extent * (MEANS_LR_END / MEANS_LR) ** done,

@@ -44,8 +44,8 @@ class Published:
     megabytes: float | None = None
 
 
-# NerfBaselines' figures of 3DGS and 3DGS-MCMC; splats from the literature on 3DGS; the third
-# method's from Liu et al. 2024, "HEMGS", with the smallest of its published sizes.
+# NerfBaselines' figures of 3DGS and 3DGS-MCMC, the splats of 3DGS from the literature on it, and those
+# of Liu et al. 2024, "HEMGS".
 PUBLISHED = (
     Published("3DGS", "chair", 35.84, 299_000),
     Published("3DGS", "lego", 35.70, 298_000),
