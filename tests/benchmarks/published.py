@@ -30,6 +30,7 @@ from stages.run.pipeline import Pipeline
 from stages.scene import Splats, draw_settings_of, split_held_out
 
 MB, SIDE = 1e6, 800  # px, as published
+EARLIEST_S = 60.0  # before it the plot would show little else
 COLOURS = {"chair": "#1f5fa8", "lego": "#c8641e", "mic": "#3a8f5c"}
 
 
@@ -44,8 +45,8 @@ class Published:
     megabytes: float | None = None
 
 
-# NerfBaselines' figures of 3DGS and 3DGS-MCMC, the splats of 3DGS from the literature on it, and those
-# of Liu et al. 2024, "HEMGS".
+# NerfBaselines' figures of 3DGS and 3DGS-MCMC, the splats of 3DGS from the literature on it, and
+# the figures of Liu et al. 2024, "HEMGS".
 PUBLISHED = (
     Published("3DGS", "chair", 35.84, 299_000),
     Published("3DGS", "lego", 35.70, 298_000),
@@ -61,7 +62,8 @@ PUBLISHED = (
 
 @dataclass(frozen=True)
 class Measured:
-    """A run's figures: means over the test views; seconds of the processor."""
+    """A run's figures: means over the test views; seconds of the processor. course: seconds, and
+    PSNR of a dozen test views, while it was trained."""
 
     scene: str
     steps: int
@@ -73,6 +75,7 @@ class Measured:
     sog_db: float
     training_s: float
     all_s: float
+    course: tuple[tuple[float, float], ...] = ()
 
 
 def measure(folder: Path) -> Measured:
@@ -95,6 +98,7 @@ def measure(folder: Path) -> Measured:
         sog_db=_mean(_scores(pipeline, results.read_file(sog))),
         training_s=seconds["train"],
         all_s=sum(seconds.values()),
+        course=tuple((at["cpu_seconds"], at["psnr_db"]) for at in trained.metrics["history"]),
     )
 
 
@@ -144,14 +148,17 @@ def plot(path: Path, runs: list[Measured]) -> None:
     for scene in dict.fromkeys(run.scene for run in runs):
         same = sorted((run for run in runs if run.scene == scene), key=lambda run: run.training_s)
         style = {"color": COLOURS.get(scene), "label": scene, "ms": 4}
-        by_time.plot([r.training_s for r in same], [r.psnr_db for r in same], "o-", **style)
-        by_size.plot([r.megabytes for r in same], [r.sog_db for r in same], "o-", **style)
+        by_time.plot([r.training_s for r in same], [r.psnr_db for r in same], "o", **style)
+        longest = [(s, psnr_db) for s, psnr_db in same[-1].course if s >= EARLIEST_S]
+        if longest:
+            by_time.plot(*zip(*longest, strict=True), "-", color=COLOURS.get(scene), lw=0.9)
+        by_size.plot([r.megabytes for r in same], [r.sog_db for r in same], "o", **style)
         for other in (other for other in PUBLISHED if other.scene == scene):
             if other.megabytes is not None:
                 by_size.plot(other.megabytes, other.psnr_db, "x", color=COLOURS.get(scene))
             elif other.method == "3DGS":
                 by_time.axhline(other.psnr_db, color=COLOURS.get(scene), ls=":", lw=0.9)
-    by_time.set_title("dotted: 3D Gaussian Splatting, 30,000 steps", fontsize=9)
+    by_time.set_title("line: in training; dotted: 3D Gaussian Splatting", fontsize=9)
     by_size.set_title("crosses: HEMGS", fontsize=9)
     for axes in (by_time, by_size):
         axes.set_xscale("log")
