@@ -182,12 +182,14 @@ def _figures(splats: Splats, quantised: QuantisedSplats, evaluator: _Measure) ->
     kept, plain, row = quantised.splats, quantised.plain, FORMATS["splat"]
     raw_db, kept_db = evaluator.psnr(splats), evaluator.psnr_at_sizes(kept, "psnr_kept")
     plain_db = None if plain is None else evaluator.psnr(plain)
-    change = {} if plain_db is None else {_PLAIN_CHANGE: plain_db - kept_db["psnr_kept_db"]}
+    change = {}
+    if plain_db is not None:
+        change[_PLAIN_CHANGE] = round(plain_db - kept_db["psnr_kept_db"], 3)
     return {
         "psnr_raw_db": raw_db,
         **kept_db,
         "psnr_plain_db": plain_db,
-        **{name: round(value, 3) for name, value in change.items()},
+        **change,
         "psnr_splat32_db": evaluator.psnr(write_and_read(row, splats_to_write(row, quantised))),
         "sh_degree": kept.sh_degree,
         "splats_by_sh_degree": [

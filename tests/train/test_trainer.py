@@ -1,5 +1,6 @@
 """Training as a whole: known small problems, and runs that stop and go on."""
 
+import json
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
@@ -16,7 +17,7 @@ from stages.raster.cpu.rasteriser import CpuRasteriser
 from stages.raster.definition import RasterSettings, splat_arrays
 from stages.raster.draw import render
 from stages.raster.smoothing import smoothing_widths
-from stages.scene import DrawSettings, Splats, look_at, split_held_out
+from stages.scene import DrawSettings, Splats, TrainedSplats, look_at, split_held_out
 from stages.train import cap
 from stages.train import stage as train
 from stages.train.checkpoint import MAGIC
@@ -460,6 +461,18 @@ def test_a_cap_that_the_user_or_a_preset_set_is_reported_without_a_warning(tmp_p
     assert "train-splat-cap-reached" not in dict(report.warnings)
     assert cap.cap_for(tmp_path, 500, 100) == cap.Cap(500, "--max-splats")
     assert not (tmp_path / cap.FILE_NAME).exists()
+
+
+def test_trained_splats_know_their_steps_and_those_of_an_older_version_do_not(tmp_path):
+    scene = small_scene(tmp_path)
+    folder = tmp_path / "out"
+    folder.mkdir()
+    train.save(folder, TrainedSplats(scene.splats, dropout=True, steps=30))
+    assert (train.load(folder).steps, train.load(folder).dropout) == (30, True)
+    facts = json.loads((folder / "training.json").read_text())
+    del facts["steps"]
+    (folder / "training.json").write_text(json.dumps(facts))
+    assert train.load(folder).steps == 0
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.5])
