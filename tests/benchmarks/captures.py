@@ -67,6 +67,7 @@ SOURCES = {
         _NERF_SYNTHETIC,
         commit="cc9ace63c30d9bdbf9931b01786537316619821b",
     ),
+    "chair": Source("rounak890/nerf_data", "", _NERF_SYNTHETIC),
     "fern": Source("luo-ziyuan/CopyRNeRF-code", "data/nerf_llff_data/fern", _LLFF),
     "horns": Source("Bussler/CustomNeRF", "data/horns", _LLFF),
     "kitchen": Source("facebookresearch/vggsfm", "examples/kitchen"),
