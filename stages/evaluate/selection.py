@@ -63,6 +63,7 @@ class RemovalLimits:
         share: of the splats; so many times `SH_FACTOR` may lose SH degrees.
         change: summed squared change of the pictures that removed splats may make, as if the
             effects of single removals added up. Floaters do not count.
+        spare: splats that contribute less for each parameter go beyond `change`, too.
         complete: whether contributions to all training views are known. If not, other views may
             need what these hardly see: only splats outside the region around all views are then
             removed at any multiplier.
@@ -72,6 +73,7 @@ class RemovalLimits:
     most: int
     share: float = ROUND_SHARE
     change: float = np.inf
+    spare: float = 0.0
     complete: bool = True
 
 
@@ -105,7 +107,7 @@ def select_removal(
     allowed = free | _least_of_neighbours(splats, ratio)
     chosen = order[(allowed & (ratio < limits.sse_per_parameter))[order]][: limits.most]
     changes = np.where(free[chosen], 0.0, contributions.picture_change[chosen])
-    chosen = chosen[np.cumsum(changes) <= limits.change]
+    chosen = chosen[(np.cumsum(changes) <= limits.change) | (ratio[chosen] < limits.spare)]
     removed = np.zeros(len(splats), bool)
     removed[chosen] = True
     # SH coefficients that contribute more than the last removed splat stay

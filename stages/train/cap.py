@@ -81,8 +81,12 @@ def cap_for(folder: Path, max_splats: int, determined: int) -> Cap:
 def splats_determined(cameras: Sequence[Camera], sh_degree: int) -> int:
     """How many splats of `sh_degree` have no more parameters than the views of `cameras` have pixel
     values. Of more splats, some would be undetermined."""
-    numbers = sum(3 * camera.width * camera.height for camera in cameras)
-    return max(MIN_CAP, numbers // int(parameters_per_splat(np.array(sh_degree))))
+    return max(MIN_CAP, pixel_values(cameras) // int(parameters_per_splat(np.array(sh_degree))))
+
+
+def pixel_values(cameras: Sequence[Camera]) -> int:
+    """How many pixel values the views of `cameras` have: three for each pixel."""
+    return sum(3 * camera.width * camera.height for camera in cameras)
 
 
 def lower_cap(folder: Path, splats: int) -> Cap:

@@ -3,7 +3,9 @@ would change least. The steps that are left repair what the removal costs.
 
 The pictures decide how many. A round may change them by as much as lowers their PSNR by its part
 of `LOSS_DB`, if the changes by single splats add up and are not correlated with the present error.
-So a scene keeps the splats that it needs, whatever the cap was.
+Beyond that go splats that lower the error of the training views by less than so many free
+parameters do where they fit noise: see `spare_error`. With few photographs these are many. So a
+scene keeps the splats that it needs, whatever the cap was.
 
 GaussianSpa (Zhang et al. 2025) removes splats during training by an optimisation that drives their
 opacities to zero. Here splats are chosen by how much the pictures would change, as in
@@ -20,7 +22,8 @@ from stages.evaluate.contribution import MAX_MEASURED_VIEWS, measure_contributio
 from stages.evaluate.evaluation import EvaluationView
 from stages.evaluate.selection import RemovalLimits, select_removal
 from stages.raster.smoothing import smoothed
-from stages.scene import Splats, evenly_spaced
+from stages.scene import Splats, evenly_spaced, parameters_per_splat
+from stages.train.cap import pixel_values
 from stages.train.conversion import splats_of, valid_rows
 from stages.train.density import DensityRule
 from stages.train.optimiser import Model, empty_model
@@ -65,13 +68,31 @@ class Sparsification:
         views = (_evaluation_view(task.views[r].name, trainer.level(r), background) for r in rows)
         contributions = measure_contributions(splats, views, task.backend, truncation=False)
         change = contributions.sse * (10 ** (LOSS_DB / len(SHARES) / 10) - 1)
+        parameters = int(parameters_per_splat(splats.sh_degrees).sum())
+        spare = spare_error(contributions.sse, pixel_values(cameras), parameters)
         most = int(LARGEST_ROUND * len(splats))
         every = len(rows) == len(task.views)
-        limits = RemovalLimits(np.inf, most, change=change, complete=every)
+        limits = RemovalLimits(np.inf, most, change=change, spare=spare, complete=every)
         removal = select_removal(splats, contributions, cameras, limits)
         if removal is None:
             return model
         return model.take(~removal.removed | ~self.density.inside(model))
+
+
+def spare_error(sse: float, values: int, parameters: int) -> float:
+    """The summed squared error that one more parameter must save, or it lowers the error of the
+    training views and not that of others.
+
+    Generalised cross-validation (Craven and Wahba 1979) estimates the error of values that were not
+    fitted as S n / (n - p)^2, up to a constant. Without a splat of q parameters S grows by its
+    change D of the pictures, and the estimate falls where D < 2 S q / (n - p).
+
+    Args:
+        sse: S, of the measured training views.
+        values: n, of all training views.
+        parameters: p, of all splats; where they are no fewer than the values, any may go.
+    """
+    return 2.0 * sse / max(1, values - parameters)
 
 
 def _evaluation_view(name: str, level: Level, background: float) -> EvaluationView:

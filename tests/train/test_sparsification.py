@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from stages.base.stage import Report
 from stages.raster.definition import RasterSettings
@@ -15,7 +17,13 @@ from stages.train.density import AdaptiveDensity, BoundedDensity
 from stages.train.hooks import FLOATER_REMOVALS
 from stages.train.loop import train as train_all
 from stages.train.schedule import DENSIFICATION_END, Schedule
-from stages.train.sparsification import LOSS_DB, SHARES, Sparsification
+from stages.train.sparsification import (
+    LARGEST_ROUND,
+    LOSS_DB,
+    SHARES,
+    Sparsification,
+    spare_error,
+)
 from tests.scenes import camera, cloud, join, splats
 from tests.train.pictures import trainer_of, view_of
 
@@ -77,18 +85,70 @@ def test_splats_are_removed_after_densification_at_the_planned_steps_only(tmp_pa
     assert set(fewer) & rounds
 
 
-def test_a_round_costs_no_more_than_its_part_of_the_bound(tmp_path):
-    faint = np.random.default_rng(0).uniform(-3, 0.5, 600).astype(np.float32)  # none is hidden
-    start = replace(cloud(600, 40, 30, degree=0, size_px=1.0), opacity_logits=faint)
-    picture = noisy(drawn(start), 0.03)
-    views = [view_of(f"{k}", picture, WHERE) for k in range(3)]
-    left = sparser(trainer(tmp_path, start, views=views), start)
-    assert 0 < 600 - len(left) < 120  # the bound and not the largest share of a round decides
+LARGE = camera(160, 120)  # ten views of it have many pixel values for each of 600 splats
+
+
+def faint_scene():
+    """600 small splats, of which none is hidden."""
+    faint = np.random.default_rng(0).uniform(-3, 0.5, 600).astype(np.float32)
+    return replace(cloud(600, 40, 30, degree=0, size_px=1.0), opacity_logits=faint)
+
+
+def left_of(start, where, views, folder):
+    """What a round leaves of `start`, seen in equal noisy `views`."""
+    picture = noisy(drawn(start, where), 0.03)
+    seen = [view_of(f"{k}", picture, where) for k in range(views)]
+    left = sparser(trainer(folder, start, views=seen), start)
     kept = start.take(np.isin(start.means[:, 0], left.means[:, 0]))
-    change = np.square(drawn(kept) - drawn(start)).sum()
-    allowed = np.square(drawn(start) - picture).sum() * (10 ** (LOSS_DB / len(SHARES) / 10) - 1)
+    change = np.square(drawn(kept, where) - drawn(start, where)).sum()
+    return len(left), change, np.square(drawn(start, where) - picture).sum()
+
+
+def test_a_round_costs_no_more_than_its_part_of_the_bound_where_photographs_are_many(tmp_path):
+    start = faint_scene()
+    left, change, sse = left_of(start, LARGE, 10, tmp_path)
+    assert 0 < 600 - left < 120  # the bound and not the largest share of a round decides
+    allowed = sse * (10 ** (LOSS_DB / len(SHARES) / 10) - 1)
     # removed splats may lie over each other, which sums of single changes do not know
     assert 0.5 * allowed < change < 1.5 * allowed
+
+
+def test_with_few_pixel_values_for_each_parameter_more_splats_go(tmp_path):
+    start = faint_scene()
+    few, change, sse = left_of(start, WHERE, 3, tmp_path / "few")
+    many, *_ = left_of(start, WHERE, 30, tmp_path / "many")
+    assert few < many
+    # and by no more than as many free parameters would lower the error of noise
+    values, parameters = 3 * 3 * 40 * 30, 600 * 14
+    assert 3 * change < 1.5 * (600 - few) * 14 * spare_error(3 * sse, values, parameters)
+
+
+@settings(max_examples=50)
+@given(
+    values=st.integers(1000, 10**9),
+    share=st.floats(0.0, 0.999),
+    removed=st.integers(1, 59),
+    sse=st.floats(1e-6, 1e6),
+)
+def test_generalised_cross_validation_falls_where_a_splat_saves_less_than_the_spare_error(
+    values, share, removed, sse
+):
+    def estimate(squared_error, count):
+        return squared_error * values / (values - count) ** 2
+
+    parameters = max(removed, int(share * values))
+    limit = removed * spare_error(sse, values, parameters)
+    fewer = parameters - removed
+    assert estimate(sse + 0.99 * limit, fewer) < estimate(sse, parameters)
+    if removed < 0.01 * (values - parameters):
+        assert estimate(sse + 1.02 * limit, fewer) > estimate(sse, parameters)
+
+
+def test_of_more_parameters_than_pixel_values_any_splat_may_go(tmp_path):
+    start = cloud(1000, 40, 30, degree=0)
+    view = [view_of("0", noisy(drawn(start)), WHERE)]
+    left = sparser(trainer(tmp_path, start, views=view), start)
+    assert len(left) == 1000 - LARGEST_ROUND * 1000
 
 
 def test_the_picture_changes_far_less_than_without_as_many_at_random(tmp_path):
@@ -124,7 +184,7 @@ def test_cut_out_views_are_compared_over_the_background_that_they_are_drawn_on(t
         replace(level, mask=alpha, outside=TRANSPARENT)
         for level in map(view.levels.__getitem__, (0, 1))
     ]
-    views = [replace(view, levels=levels)] * 3
+    views = [replace(view, levels=levels)] * 30
     white = replace(NEAR, background=1.0)
     on_white = sparser(trainer(tmp_path, start, views=views, draw=white), start)
     on_black = sparser(trainer(tmp_path, start, views=views), start)
