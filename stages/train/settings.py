@@ -120,7 +120,7 @@ class TrainSettings:
 
 PRESETS: dict[str, TrainSettings] = {
     "preview": TrainSettings(steps=2000, train_side=480, sh_degree=1, max_splats=60_000),
-    "standard": TrainSettings(steps_per_view=60, train_side=800, sh_degree=2, max_splats=250_000),
+    "standard": TrainSettings(steps_per_view=60, train_side=800, sh_degree=2, max_splats=150_000),
     "best": TrainSettings(steps_per_view=800, train_side=1600, sh_degree=3),
 }
 

@@ -458,7 +458,7 @@ def test_an_empty_value_takes_an_option_with_a_file_back(splat) -> None:
 def test_a_lost_run_file_means_the_default_preset(splat) -> None:
     splat("ingest", "photos")
     Path("run/run.json").unlink()
-    assert "max splats 250,000" in splat("process", "photos").stderr
+    assert "max splats 150,000" in splat("process", "photos").stderr
 
 
 def test_folders_that_may_not_be_read_hide_no_run_folder(splat, monkeypatch) -> None:
