@@ -83,8 +83,8 @@ def spare_error(sse: float, values: int, parameters: int) -> float:
     """The summed squared error that one more parameter must save, or it lowers the error of the
     training views and not that of others.
 
-    Generalised cross-validation (Craven and Wahba 1979) estimates the error of values that were not
-    fitted as S n / (n - p)^2, up to a constant. Without a splat of q parameters S grows by its
+    Generalised cross-validation (Craven and Wahba 1979) estimates the error of values that took no
+    part as S n / (n - p)^2, up to a constant. Without a splat of q parameters S grows by its
     change D of the pictures, and the estimate falls where D < 2 S q / (n - p).
 
     Args:
