@@ -24,7 +24,7 @@ from stages.run.manifest import json_value
 from stages.run.pipeline import Pipeline
 from stages.run.stages import STAGE_NAMES, STAGE_OF, options_of
 from stages.scene import Camera, ExportedAssets, Reconstruction, Splats
-from stages.train.settings import PRESETS
+from stages.train.settings import PRESETS, TrainSettings
 from stages.viewer.sinks import eight_bits
 
 
@@ -56,6 +56,7 @@ class Options(TypedDict, total=False):
     fill: bool
     steps: int
     steps_per_view: int
+    splats_per_view: int
     train_side: int
     sh_degree: int
     max_splats: int
@@ -166,7 +167,8 @@ def process(
         raise TypeError(f"no stage has the option {', '.join(sorted(unknown))}")
     pipeline = Pipeline(Path(run_folder), Path(photos))
     options["formats"] = pipeline.with_exported(options.get("formats", DEFAULT_FORMATS))
-    settings = {name: changed(found, options_of(name, options)) for name, found in settings.items()}
+    given = TrainSettings.completed(options)
+    settings = {name: changed(found, options_of(name, given)) for name, found in settings.items()}
     listener = _Calling(progress) if progress else None
     pipeline.run(settings, listener=listener, stop=cancel or Event())
     return open_run(run_folder)

@@ -118,6 +118,8 @@ def combined(
         chosen["train"] = replace(PRESETS[preset], splats=chosen["train"].splats)
     if given.get("splats") not in (None, UNSET) and "steps" not in given:
         given = {**given, "steps": 0}
+    if "train" in chosen:
+        given = TrainSettings.completed(given)
     new = {
         name: changed(settings, given if len(chosen) == 1 else options_of(name, given))
         for name, settings in chosen.items()

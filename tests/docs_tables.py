@@ -197,6 +197,8 @@ def presets() -> str:
     rows: list[tuple[str, ...]] = []
     for name, preset in PRESETS.items():
         cap = f"{preset.max_splats:,}" if preset.max_splats else "by memory and photographs"
+        if preset.splats_per_view:
+            cap += f", and {preset.splats_per_view:,} a view"
         size = f"{preset.train_side} px"
         steps = f"{preset.steps:,}" if preset.steps else f"1,500 and {preset.steps_per_view} a view"
         rows.append((f"`{name}`", steps, size, str(preset.sh_degree), cap))

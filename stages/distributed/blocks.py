@@ -145,6 +145,7 @@ class _BlockTraining:
             steps_per_view=-(-self.settings.steps_per_view // COARSE_STEPS),
             train_side=max(16, self.settings.train_side // COARSE_SIDE),
             max_splats=max(1, self.settings.max_splats // fewer),
+            splats_per_view=0,
         )
         block_folders.begin(self.pipeline, self.root / COARSE, self.whole, seeds, settings)
         self._run([COARSE], settings.max_splats)
@@ -232,7 +233,9 @@ class _BlockTraining:
         own = max(1, round(self.settings.max_splats * inside / len(coarse)))
         start = merge.initial_splats(seeds, coarse, wide, own)
         cap: int = max(len(start), len(coarse) - inside + own)
-        settings = replace(self.settings, max_splats=cap, within=(*wide.low, *wide.high))
+        settings = replace(
+            self.settings, max_splats=cap, splats_per_view=0, within=(*wide.low, *wide.high)
+        )
         block_folders.begin(self.pipeline, self.root / name, part, start, settings)
         return cap
 

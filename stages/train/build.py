@@ -56,7 +56,7 @@ def make_trainer(
     held_out = load_evaluation_views(reconstruction.folder, held, draw_settings)
     _warn_of_small_photographs(reconstruction, settings, report)
     cameras = {view.name: view.levels[-1].camera for view in train}
-    cap = _cap(start, settings, folder, splats_determined([*cameras.values()], sh_degree))
+    cap = _cap(start, settings, folder, [*cameras.values()], sh_degree)
     report.metric("splat_cap_free_mib", cap.free_mib)
     extent = training_extent(reconstruction)
     refinement = _refinement(settings, cameras, held_out, extent)
@@ -92,11 +92,20 @@ def _part(settings: TrainSettings) -> tuple[int, float]:
     return DENSIFYING_PART if settings.densify or settings.within else LAST_PART
 
 
-def _cap(start: Splats, settings: TrainSettings, folder: Path, determined: int) -> Cap:
+def _cap(
+    start: Splats,
+    settings: TrainSettings,
+    folder: Path,
+    cameras: Sequence[Camera],
+    sh_degree: int,
+) -> Cap:
+    """cameras: of the training views."""
+    determined = splats_determined(cameras, sh_degree)
+    limits = determined, settings.splats_per_view * len(cameras)
     if settings.splats is None:
-        return cap_for(folder, settings.max_splats, determined)
+        return cap_for(folder, settings.max_splats, *limits)
     most = len(start) if _part(settings) == LAST_PART else settings.max_splats
-    return cap_for(folder, most, determined).for_given(len(start))
+    return cap_for(folder, most, *limits).for_given(len(start))
 
 
 def _refinement(

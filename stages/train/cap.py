@@ -1,7 +1,8 @@
 """The largest number of splats of a run. It is chosen at the first start and kept on resumption.
 
 Without --max-splats it is the smaller of two: what half of the free memory holds, and the number of
-splats that have as many parameters as the training views have pixel values.
+splats that have as many parameters as the training views have pixel values. --splats-per-view may
+lower either.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ FILE_NAME = "cap.json"
 FREE_MEMORY = "free memory"
 DEVICE_MEMORY = "the GPU's memory"
 PHOTOGRAPHS = "the photographs' pixels"
+VIEWS = "--splats-per-view"
 MIN_CAP = 10_000  # splats that are always allowed
 BASE_MIB = 2048.0  # libraries, and at most 1 GiB of photographs
 
@@ -32,7 +34,7 @@ class Cap:
 
     Args:
         splats: the largest number allowed.
-        origin: "--max-splats", FREE_MEMORY, PHOTOGRAPHS or DEVICE_MEMORY.
+        origin: "--max-splats", VIEWS, FREE_MEMORY, PHOTOGRAPHS or DEVICE_MEMORY.
         free_mib: memory that was free, if that decided.
     """
 
@@ -57,7 +59,7 @@ def needed_mib(splats: int) -> float:
     return BASE_MIB + training_mib(splats)
 
 
-def cap_for(folder: Path, max_splats: int, determined: int) -> Cap:
+def cap_for(folder: Path, max_splats: int, determined: int, by_views: int = 0) -> Cap:
     """The cap of the run in `folder`.
 
     A resumed run keeps the cap that was chosen first, because another one would give other bytes. A
@@ -66,16 +68,18 @@ def cap_for(folder: Path, max_splats: int, determined: int) -> Cap:
     Args:
         max_splats: as the user set it; 0 for automatic.
         determined: see `splats_determined`.
+        by_views: what --splats-per-view allows; 0 for any number.
     """
     kept = _read(folder / FILE_NAME)
     if kept is not None and (not max_splats or kept.origin == DEVICE_MEMORY):
         return kept
+    caps = [Cap(by_views, VIEWS)] if by_views else []
     if max_splats:
-        return Cap(max_splats, "--max-splats")
+        return min([Cap(max_splats, "--max-splats"), *caps], key=lambda cap: cap.splats)
     free_mib = available_mib()
     by_memory = Cap(splat_cap(free_mib), FREE_MEMORY, round(free_mib))
-    cap = min(by_memory, Cap(determined, PHOTOGRAPHS), key=lambda cap: cap.splats)
-    return _saved(cap, folder)
+    caps += [by_memory, Cap(determined, PHOTOGRAPHS)]
+    return _saved(min(caps, key=lambda cap: cap.splats), folder)
 
 
 def splats_determined(cameras: Sequence[Camera], sh_degree: int) -> int:

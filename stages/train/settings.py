@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from stages.base.settings import setting
 from stages.base.stage import Stage, in_module
@@ -43,6 +45,14 @@ class TrainSettings:
         "Largest number of splats; those that photographs can spare are removed later. 0: what "
         "free memory allows, with no more parameters than the photographs have pixel values.",
         panel="Size",
+        min=0,
+        max=100_000_000,
+    )
+    splats_per_view: int = setting(
+        0,
+        "Largest number of splats for each training view; a --max-splats that is given holds "
+        "instead. 0: no such limit.",
+        panel="Advanced",
         min=0,
         max=100_000_000,
     )
@@ -112,6 +122,12 @@ class TrainSettings:
         needs="splats",
     )
 
+    @staticmethod
+    def completed(given: Mapping[str, Any]) -> dict[str, Any]:
+        """The options `given`, by name, with those that follow: the limit of a preset for each view
+        does not hold beside a --max-splats that is given."""
+        return {"splats_per_view": 0, **given} if given.get("max_splats") else dict(given)
+
     @property
     def antialias(self) -> bool:
         """Whether splats are trained to be drawn with opacity compensation."""
@@ -120,7 +136,13 @@ class TrainSettings:
 
 PRESETS: dict[str, TrainSettings] = {
     "preview": TrainSettings(steps=2000, train_side=480, sh_degree=1, max_splats=60_000),
-    "standard": TrainSettings(steps_per_view=60, train_side=800, sh_degree=2, max_splats=150_000),
+    "standard": TrainSettings(
+        steps_per_view=60,
+        train_side=800,
+        sh_degree=2,
+        max_splats=250_000,
+        splats_per_view=7_000,
+    ),
     "best": TrainSettings(steps_per_view=800, train_side=1600, sh_degree=3),
 }
 

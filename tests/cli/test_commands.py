@@ -436,7 +436,7 @@ def test_training_that_goes_on_says_which_settings_it_keeps(splat) -> None:
         "max splats 60,000 (as recorded in the run)." in again.stderr
     )
     other = splat("process", "--preset", "standard").stderr
-    assert "Training: steps per view 60, train side 800, SH degree 2, max splats 150," in other
+    assert "Training: steps per view 60, train side 800, SH degree 2, max splats 250," in other
 
 
 def test_naming_the_photographs_again_keeps_earlier_options(splat) -> None:
@@ -458,7 +458,7 @@ def test_an_empty_value_takes_an_option_with_a_file_back(splat) -> None:
 def test_a_lost_run_file_means_the_default_preset(splat) -> None:
     splat("ingest", "photos")
     Path("run/run.json").unlink()
-    assert "max splats 150,000" in splat("process", "photos").stderr
+    assert "max splats 250,000" in splat("process", "photos").stderr
 
 
 def test_folders_that_may_not_be_read_hide_no_run_folder(splat, monkeypatch) -> None:

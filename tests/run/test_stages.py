@@ -9,6 +9,7 @@ import pytest
 from splatcli import run_settings
 from stages.base.settings import settings_of
 from stages.run.stages import SHARED_OPTIONS, STAGE_NAMES, STAGE_OF, STAGES, options_of
+from stages.train.settings import PRESETS
 
 
 def test_stages_read_earlier_ones_only() -> None:
@@ -45,3 +46,13 @@ def test_an_option_of_one_stage_goes_to_that_stage() -> None:
     given = {"steps": 7, "seed": 3, "max_splats": 9}
     assert options_of("train", given) == given
     assert options_of("sfm", given) == {"steps": 7, "seed": 3}  # `steps` is no field of it
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_number_of_splats_that_is_given_holds_for_any_number_of_photographs(preset: str) -> None:
+    preset_alone = run_settings.of_new_run({"preset": preset})["train"]
+    assert preset_alone.splats_per_view == PRESETS[preset].splats_per_view
+    given = run_settings.of_new_run({"preset": preset, "max_splats": 400_000})["train"]
+    assert (given.max_splats, given.splats_per_view) == (400_000, 0)
+    both = {"preset": preset, "max_splats": 400_000, "splats_per_view": 500}
+    assert run_settings.of_new_run(both)["train"].splats_per_view == 500

@@ -502,6 +502,29 @@ def test_splats_have_no_more_parameters_than_the_views_have_values(tmp_path, mon
     assert cap.cap_for(tmp_path, 0, 10**9).origin == "free memory"
 
 
+def test_few_views_allow_fewer_splats_and_no_number_of_views_more(tmp_path, monkeypatch):
+    assert cap.cap_for(tmp_path, 250_000, 10**9, 140_000) == cap.Cap(140_000, cap.VIEWS)
+    assert cap.cap_for(tmp_path, 250_000, 10**9, 700_000) == cap.Cap(250_000, "--max-splats")
+    monkeypatch.setattr(cap, "available_mib", lambda: 4096.0)
+    assert cap.cap_for(tmp_path, 0, 10**9, 20_000) == cap.Cap(20_000, cap.VIEWS)
+    assert cap.cap_for(tmp_path, 0, 10**9, 30_000).splats == 20_000  # it stays as it began
+    (tmp_path / cap.FILE_NAME).unlink()
+    assert cap.cap_for(tmp_path, 0, 15_000, 20_000) == cap.Cap(15_000, cap.PHOTOGRAPHS)
+
+
+def test_a_limit_for_each_view_is_that_times_the_training_views(tmp_path):
+    scene = small_scene(tmp_path)
+    inputs = {"sfm": scene.reconstruction, "seed": scene.splats.with_sh_degree(0)}
+    settings = TrainSettings(
+        steps=30, train_side=48, sh_degree=0, max_splats=10_000, splats_per_view=20
+    )
+    report = Report()
+    (tmp_path / "out").mkdir()
+    train.run(inputs, settings, tmp_path / "out", report)
+    assert report.metrics["splat_cap"] == 20 * report.metrics["training_views"]
+    assert report.metrics["splat_cap_from"] == "--splats-per-view"
+
+
 def test_a_damaged_cap_file_is_written_again(tmp_path, monkeypatch):
     monkeypatch.setattr(cap, "available_mib", lambda: 4096.0)
     for text in ("", "[]", '{"splats": "many", "origin": "?"}', '{"splats": 0, "origin": "?"}'):
