@@ -18,7 +18,9 @@ import splatcli
 from splatcli import Interrupted, SplatError, open_run, process
 from splatcli.api import Options
 from stages.base.settings import settings_of
+from stages.run.pipeline import Pipeline
 from stages.run.stages import STAGES
+from stages.train.settings import TrainSettings
 from tests import scenes
 from tests.processes import ROOT
 
@@ -96,6 +98,16 @@ def test_a_run_is_cancelled_from_its_progress_and_signals_stay_as_they_are(tmp_p
     assert 0 <= seen[0].done <= seen[0].total
     assert handlers == {signal.getsignal(signal.SIGINT)}
     assert not (tmp_path / "run" / "2-sfm").exists()
+
+
+def test_a_number_of_splats_that_is_given_holds_as_it_does_for_the_command(tmp_path: Path) -> None:
+    """The limit of `standard` for each view does not lower it."""
+    cancel = Event()
+    cancel.set()
+    with pytest.raises(Interrupted):
+        process(photographs(tmp_path / "p"), tmp_path / "run", cancel=cancel, max_splats=400_000)
+    train = Pipeline(tmp_path / "run").recorded_settings({"train": TrainSettings()})["train"]
+    assert (train.max_splats, train.splats_per_view) == (400_000, 0)
 
 
 def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
