@@ -26,14 +26,14 @@ MEANS_END_POWER = 1.2
 # Learning rates decay from this share of the run on, to this share of their value.
 RATE_DECAY_FROM, RATE_DECAY_END = 0.6, 0.1
 MIN_DENSIFY_INTERVAL = 50  # steps: fewer see too little of the scene
-SCALES = (0.25, 0.5, 1.0)  # of the images' sides
-QUARTER, HALF, FULL = range(len(SCALES))
+SCALES = (0.125, 0.25, 0.5, 1.0)  # of the images' sides
+EIGHTH, QUARTER, HALF, FULL = range(len(SCALES))
 HALF_SIZE_END = 0.2  # share of the run that draws small images: they are cheap and smooth
 # `Schedule.since` of a run that starts from trained splats, without and with densification.
 LAST_PART, DENSIFYING_PART = (0, RATE_DECAY_FROM), (0, HALF_SIZE_END)
-# After densification, one of 20 steps draws at a quarter and two at half of the size, so that the
-# splats are right in small images, too.
-SMALLER_STEPS = {4: QUARTER, 9: HALF, 19: HALF}
+# After densification, one of 20 steps draws at an eighth, one at a quarter and two at half of the
+# size, so that the splats are right in small images, too.
+SMALLER_STEPS = {4: QUARTER, 9: HALF, 14: EIGHTH, 19: HALF}
 SMALLER_STEPS_PERIOD = 20
 
 
