@@ -200,7 +200,7 @@ def presets() -> str:
         if preset.splats_per_view:
             cap += f", and {preset.splats_per_view:,} a view"
         size = f"{preset.train_side} px"
-        steps = f"{preset.steps:,}" if preset.steps else f"1,500 and {preset.steps_per_view} a view"
+        steps = f"{preset.steps:,}" if preset.steps else f"{preset.steps_per_view} a view"
         rows.append((f"`{name}`", steps, size, str(preset.sh_degree), cap))
     return _table(("`--preset`", "steps", "size", "SH degree", "splats, at most"), rows)
 

@@ -14,7 +14,6 @@ from splatcli.app import ENTRIES, loaded
 from stages.base.distribution import VERSION
 from stages.formats.format_table import TABLE
 from stages.run.stages import STAGE_NAMES
-from stages.train.build import FIRST_STEPS
 from stages.train.settings import PRESETS
 from tests.docs_commands import bash_lines, inline_commands, splat_commands
 from tests.docs_picture import EVERYWHERE, PICTURE, Drawing, imports, reached_from
@@ -90,7 +89,7 @@ def test_presets_are_those_of_the_code(page: str) -> None:
     text = (ROOT / page).read_text(encoding="utf-8").replace(",", "")
     for name, preset in PRESETS.items():
         (row,) = [line for line in text.splitlines() if re.match(rf"\| `{name}`.*steps.* at", line)]
-        views = f"{FIRST_STEPS} steps and {preset.steps_per_view} a training view"
+        views = f"{preset.steps_per_view} steps a training view"
         steps = f"{preset.steps} steps" if preset.steps else views
         assert f"{steps} at {preset.train_side} px" in row
 

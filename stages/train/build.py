@@ -27,7 +27,7 @@ from stages.train.settings import TrainSettings
 from stages.train.trainer import Trainer, TrainingTask
 from stages.train.views import load_views
 
-FIRST_STEPS = 1500  # of a run, however few its training views
+LEAST_STEPS = 2000  # of a run, however few its training views
 
 
 def make_trainer(
@@ -137,7 +137,7 @@ def _warn_of_small_photographs(
 
 def _most_steps(settings: TrainSettings, views: int) -> int:
     """How many steps so many training views are worth."""
-    return min(FIRST_STEPS + settings.steps_per_view * views, PUBLISHED_STEPS)
+    return min(max(LEAST_STEPS, settings.steps_per_view * views), PUBLISHED_STEPS)
 
 
 def _on_the_host(backend: str, report: Report) -> str:

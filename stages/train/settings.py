@@ -18,16 +18,16 @@ from stages.raster.backends import backend_setting
 class TrainSettings:
     steps: int = setting(
         0,
-        "Training steps, with one photograph each. 0: 1,500, and --steps-per-view for each "
-        "training view, 30,000 at most; with --splats none.",
+        "Training steps, with one photograph each. 0: --steps-per-view for each training view, "
+        "at least 2,000 and at most 30,000; with --splats none.",
         panel="Quality and time",
         min=0,
         max=1_000_000,
     )
     steps_per_view: int = setting(
-        60,
-        "Training steps for each training view, beside 1,500, where --steps does not give their "
-        "number, and at most where --seconds does.",
+        150,
+        "Training steps for each training view where --steps does not give their number, and at "
+        "most where --seconds does.",
         panel="Advanced",
         min=1,
         max=1_000_000,
@@ -137,7 +137,7 @@ class TrainSettings:
 PRESETS: dict[str, TrainSettings] = {
     "preview": TrainSettings(steps=2000, train_side=480, sh_degree=1, max_splats=60_000),
     "standard": TrainSettings(
-        steps_per_view=60,
+        steps_per_view=150,
         train_side=800,
         sh_degree=2,
         max_splats=250_000,
@@ -148,7 +148,7 @@ PRESETS: dict[str, TrainSettings] = {
 
 STAGE = Stage(
     "train",
-    version=39,
+    version=40,
     reads=("sfm", "seed"),
     settings_type=TrainSettings,
     **in_module("stages.train.stage"),

@@ -5,7 +5,7 @@ import pytest
 
 from stages.base.stage import Report
 from stages.scene import DrawSettings
-from stages.train.build import FIRST_STEPS, make_trainer
+from stages.train.build import LEAST_STEPS, make_trainer
 from stages.train.conversion import model_of
 from stages.train.density import AdaptiveDensity, gradient_threshold
 from stages.train.hooks import Densification, step_hooks
@@ -82,21 +82,20 @@ def steps_of(tmp_path, views, **settings):
 
 def test_each_training_view_takes_its_steps(tmp_path):
     """One of five photographs is held out."""
-    most = FIRST_STEPS + 400
-    assert steps_of(tmp_path / "a", 5, steps_per_view=100) == (most, most)
+    assert steps_of(tmp_path / "a", 5, steps_per_view=1_000) == (4_000,) * 2
     assert steps_of(tmp_path / "b", 5, steps_per_view=10_000) == (PUBLISHED_STEPS,) * 2
+    assert steps_of(tmp_path / "c", 5, steps_per_view=100) == (LEAST_STEPS,) * 2
 
 
 def test_more_photographs_never_take_fewer_steps(tmp_path):
     numbers = (3, 4, 8, 9)
-    made = [steps_of(tmp_path / str(n), n, steps_per_view=100)[0] for n in numbers]
+    made = [steps_of(tmp_path / str(n), n, steps_per_view=500)[0] for n in numbers]
     assert made == sorted(made)
 
 
 def test_a_given_number_of_steps_is_made(tmp_path):
-    most = FIRST_STEPS + 400
-    assert steps_of(tmp_path / "a", 5, steps=5000, steps_per_view=100) == (5000, 5000)
-    assert steps_of(tmp_path / "b", 5, steps=300, steps_per_view=100) == (300, most)
+    assert steps_of(tmp_path / "a", 5, steps=5000, steps_per_view=1_000) == (5000, 5000)
+    assert steps_of(tmp_path / "b", 5, steps=300, steps_per_view=1_000) == (300, 4_000)
 
 
 def test_steps_that_take_a_second_each_still_end_in_time():
