@@ -53,6 +53,7 @@ def show(pipeline: Pipeline, until: str | None) -> None:
     rows.append(("all", console.duration(total_s), memory(peak_mib), ""))
     console.table(("stage", "time", "peak memory", "result"), rows)
     for manifest in manifests:
+        show_choice(manifest)
         show_quality(manifest)
     if assets:
         console.out.print()
@@ -107,6 +108,22 @@ def headline(manifest: Manifest) -> str:
     chosen = {n: manifest.metrics[n] for n in names if n in manifest.metrics}
     counts = {n: len(v) if isinstance(v, (list, dict)) else v for n, v in chosen.items()}
     return console.figures(counts)
+
+
+def show_choice(manifest: Manifest) -> None:
+    """Print what the number of training views decided: nothing where --steps, --seconds or
+    --splats did."""
+    metrics, settings = manifest.metrics, manifest.settings
+    given = any(settings.get(name) for name in ("steps", "seconds", "splats"))
+    if manifest.stage != "train" or given or "splat_cap" not in metrics:
+        return
+    views = counted(metrics["training_views"], "training view")
+    console.out.print(
+        f"\nChosen for {views}: {metrics['steps']:,} steps at {metrics['side_px']} px,\n"
+        f"and {metrics['splats']:,} of at most {metrics['splat_cap']:,} splats. What more would "
+        "give:\ndocs/guide/presets.md#what-more-would-give-in-your-scene",
+        markup=False,
+    )
 
 
 def show_quality(manifest: Manifest) -> None:

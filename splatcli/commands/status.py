@@ -59,6 +59,7 @@ def _print(pipeline: Pipeline, steps: list[Step], busy: int | None) -> None:
     )
     for step in steps:
         if step.manifest and not step.will_run:
+            run_result.show_choice(step.manifest)
             run_result.show_quality(step.manifest)
     if busy:
         console.out.print(f"\nProcess {busy} is working on it now.")

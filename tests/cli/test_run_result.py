@@ -19,8 +19,12 @@ def for_people(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(console.mode, "quiet", False)
 
 
-def shown(capsys: pytest.CaptureFixture[str], verdict: dict[str, str]) -> str:
-    """The output for a run of `sfm` and `train`."""
+def shown(
+    capsys: pytest.CaptureFixture[str],
+    verdict: dict[str, str],
+    settings: dict[str, Any] | None = None,
+) -> str:
+    """The output for a run of `sfm` and `train`, this with `settings`."""
     metrics: dict[str, Any] = {
         "sfm": {"unregistered_images": ["b.jpg"]},
         "train": {"verdict": verdict},
@@ -32,11 +36,14 @@ def shown(capsys: pytest.CaptureFixture[str], verdict: dict[str, str]) -> str:
             cpu_seconds=2.0,
             peak_memory_mib=100.0,
             metrics=values,
+            settings=settings or {},
             warnings=[],
         )
         for name, values in metrics.items()
     }
     metrics["train"] |= {"psnr_db": 27.107, "psnr_half_db": 27.494, "ssim": 0.8776}
+    metrics["train"] |= {"training_views": 21, "steps": 3150, "side_px": 640}
+    metrics["train"] |= {"splats": 113_229, "splat_cap": 147_000}
     metrics["train"] |= {"psnr_worst_db": 23.116, "psnr_worst_view": "IMG_0017.jpg"}
     pipeline: Any = SimpleNamespace(
         layout=SimpleNamespace(up_to=lambda until: [SimpleNamespace(name=n) for n in manifests]),
@@ -90,6 +97,16 @@ def test_psnr_and_ssim_have_a_scale_and_a_page_of_the_guide(
     text = (Path(__file__).parents[2] / file).read_text(encoding="utf-8")
     assert anchor in re.sub(r"[^\w# \n]", "", text.lower()).replace(" ", "-")
     assert max(map(len, quality.splitlines())) <= 80
+
+
+@pytest.mark.parametrize("given", [{"steps": 2000}, {"seconds": 60.0}, {"splats": "a.ply"}])
+def test_what_the_training_views_decided_is_said(
+    capsys: pytest.CaptureFixture[str], given: dict[str, Any]
+) -> None:
+    good = {"grade": "good", "text": "Good."}
+    chosen = "Chosen for 21 training views: 3,150 steps at 640 px,\nand 113,229 of at most 147,000"
+    assert chosen in shown(capsys, good)
+    assert "Chosen" not in shown(capsys, good, given)
 
 
 def test_quiet_runs_tell_only_of_a_wrong_result(
