@@ -31,9 +31,9 @@ EIGHTH, QUARTER, HALF, FULL = range(len(SCALES))
 HALF_SIZE_END = 0.2  # share of the run that draws small images: they are cheap and smooth
 # `Schedule.since` of a run that starts from trained splats, without and with densification.
 LAST_PART, DENSIFYING_PART = (0, RATE_DECAY_FROM), (0, HALF_SIZE_END)
-# After densification, one of 20 steps draws at an eighth, one at a quarter and two at half of the
-# size, so that the splats are right in small images, too.
-SMALLER_STEPS = {4: QUARTER, 9: HALF, 14: EIGHTH, 19: HALF}
+# After densification, one of 20 steps each draws at an eighth, a quarter and half of the size, so
+# that the splats are right in small images, too.
+SMALLER_STEPS = {4: QUARTER, 9: HALF, 19: EIGHTH}
 SMALLER_STEPS_PERIOD = 20
 
 

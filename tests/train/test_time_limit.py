@@ -159,6 +159,6 @@ def test_after_densification_some_pictures_are_smaller_and_count_by_the_area_of_
     assert set(scales[0, 600]) == {0.5}
     assert set(scales[600, 1500]) == {1.0}
     late = scales[1500, 3000]
-    assert [late.count(scale) for scale in SCALES] == [75, 75, 150, 1200]
+    assert [late.count(scale) for scale in SCALES] == [75, 75, 75, 1275]
     assert {plan.weight(s) for s in range(1500)} == {1.0}
     assert [plan.weight(s) for s in range(1500, 3000)] == [scale**-2 for scale in late]
