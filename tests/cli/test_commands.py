@@ -432,11 +432,11 @@ def test_training_that_goes_on_says_which_settings_it_keeps(splat) -> None:
     assert "Training:" not in fresh.stderr
     again = splat("train", "--steps", "7000")
     assert (
-        "Training: steps 7,000 (as given); steps per view 60, train side 480, SH degree 1, "
+        "Training: steps 7,000 (as given); steps per view 150, train side 480, SH degree 1, "
         "max splats 60,000 (as recorded in the run)." in again.stderr
     )
     other = splat("process", "--preset", "standard").stderr
-    assert "Training: steps per view 60, train side 800, SH degree 2, max splats 250," in other
+    assert "Training: steps per view 150, train side 800, SH degree 2, max splats 250," in other
 
 
 def test_naming_the_photographs_again_keeps_earlier_options(splat) -> None:

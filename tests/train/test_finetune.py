@@ -53,5 +53,5 @@ def test_steps_use_smaller_views_as_often_as_training_does_but_the_last_ones_do_
         finetuner.finetune(scene.splats, 20, np.zeros(len(scene.splats), np.int32))
     full = views[0].camera.width
     sizes = [(one.level.camera.width / full, one.weight) for one in given]
-    assert Counter(sizes) == {(1.0, 1.0): 34, (0.5, 4.0): 4, (0.25, 16.0): 2}
+    assert Counter(sizes) == {(1.0, 1.0): 34, (0.5, 4.0): 2, (0.25, 16.0): 2, (0.125, 64.0): 2}
     assert sizes[17:20] == sizes[37:] == [(1.0, 1.0)] * 3
