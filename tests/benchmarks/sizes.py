@@ -72,10 +72,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("targets", nargs="*", type=Path)
     parser.add_argument("--presets", nargs="+", default=(), help="of the sample to process first")
-    parser.add_argument("--out", type=Path, default=Path("sizes"), help="for --presets")
+    parser.add_argument("--out", type=Path, default=Path("sizes"), help="runs and test views")
     parser.add_argument("--sides", nargs="+", type=int, default=SIDES)
     parser.add_argument("--drawing", nargs="+", choices=list(DRAWINGS), default=["trained"])
-    parser.add_argument("--views", type=Path, default=Path("test_views"), help="kept there")
     given = parser.parse_args()
     heads = "asset", "splats", "MB", "CPU s", "drawn", "views"
     table = Table(*heads, *(f"{side} px" for side in given.sides))
@@ -85,7 +84,7 @@ def main() -> None:
         if run is None:
             raise SystemExit(f"{target} lies in no run: the cameras of the test views are unknown.")
         settings = replace(splats.draw_settings, side=PINHOLE.width)
-        views = evaluation_views(given.views, run.load("sfm"), settings)
+        views = evaluation_views(given.out / "test_views", run.load("sfm"), settings)
         for drawing in given.drawing:
             found = psnr_at(splats, views, given.sides, drawing)
             for name, chosen in VIEWS.items():
