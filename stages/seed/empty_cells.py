@@ -9,7 +9,8 @@ count for the next, so that a few thousand points cover everything that was seen
 A depth that is too small is worse than a hole: training fits the splat to what one photograph shows
 behind it, and it becomes a floater in front of other cameras. So other photographs must support the
 position (`visibility`). Without support it is moved to the far end of the photograph's depths,
-where it occludes nothing, and leaves no hole for floaters to grow into.
+where it occludes little, and leaves no hole for floaters to grow into. If other photographs show
+other colours there, it is moved to where they contradict least (`colour_evidence`).
 
 Beyond its borders a photograph is extrapolated a little in the colours of the border, but only to
 where no photograph looks.
@@ -25,27 +26,27 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from stages.scene import Camera, View
-from stages.scene.pictures import load_image, mask_of
+from stages.seed.colour_evidence import CELLS, SmallPicture, depths_by_colour
 from stages.seed.projection import cells, pixel_centres, unproject, visible_points
 from stages.seed.visibility import VisibilityConstraints
 
-CELLS = 32  # along the longer side of a photograph
 MARGIN = 0.25  # of the longer side: how far a photograph is extrapolated beyond its borders
 PLANE_POINTS = 12
 PLANE_RESIDUAL = 0.04  # RMS, relative to the inverse depth
 PLANE_EXTENT = 1.5  # factor on the range of depths in which a plane is extrapolated
 CLEARANCE = 0.5  # x the near depth of a camera: no point is added within
 SCALE = 0.5  # of a cell's size at the depth of the point
-SOLID = 250  # of 255: least mean of the mask in a cell
 FAR_PERCENTILE = 95  # of the depths of a photograph's points
 
 
 @dataclass
 class _Filling:
-    """Given points [P, 3] and the clearance around each camera, and the splats added so far."""
+    """Given points [P, 3], the clearance around each camera and the photographs by name of view;
+    and the splats added so far."""
 
     points: NDArray[np.float64]
     clearances: list[tuple[NDArray[np.float64], float]]
+    pictures: dict[str, SmallPicture]
     positions: list[NDArray[np.float64]] = field(default_factory=lambda: [np.zeros((0, 3))])
     colours: list[NDArray[np.float32]] = field(
         default_factory=lambda: [np.zeros((0, 3), np.float32)]
@@ -70,13 +71,14 @@ def fill_cells(
         training: all training views, `views` if left out: beyond its borders a photograph is
             extrapolated only to where none of them looks.
     """
-    filling = _Filling(points, [(c.centre, _clearance(c, points)) for c in cameras])
-    visibility = VisibilityConstraints(views, points)
     ordered = sorted(views, key=lambda v: v.name)
+    pictures = {view.name: SmallPicture.of(folder, view, points) for view in ordered}
+    filling = _Filling(points, [(c.centre, _clearance(c, points)) for c in cameras], pictures)
+    visibility = VisibilityConstraints(views, points)
     for view in ordered:
-        _fill(filling, folder, view, 0, visibility, training or views)
+        _fill(filling, view, 0, visibility, training or views)
     for view in ordered:
-        _fill(filling, folder, view, round(MARGIN * CELLS), visibility, training or views)
+        _fill(filling, view, round(MARGIN * CELLS), visibility, training or views)
     return (
         np.concatenate(filling.positions),
         np.concatenate(filling.colours),
@@ -86,60 +88,58 @@ def fill_cells(
 
 def _fill(
     filling: _Filling,
-    folder: Path,
     view: View,
     margin: int,
     visibility: VisibilityConstraints,
     training: tuple[View, ...],
 ) -> None:
     """Fill the empty cells of one photograph, also those in a margin (cells) beyond its borders."""
-    small = view.camera.fitted(CELLS)
-    camera = _widened(small, margin)
+    own = filling.pictures[view.name]
+    camera = _widened(own.camera, margin)
     _, pixels, _ = visible_points(camera, np.concatenate([filling.points, *filling.positions]))
     sampled = _one_per_quarter_cell(*visible_points(camera, filling.points)[1:])
     empty = _empty_cells(camera, pixels)
     rows, columns = cells(empty - margin)
-    at = rows.clip(0, small.height - 1), columns.clip(0, small.width - 1)
-    mask = mask_of(folder, view, small.width, small.height)
-    if mask is not None:
-        solid = mask[at] > SOLID
-        empty, at = empty[solid], (at[0][solid], at[1][solid])
+    at = rows.clip(0, own.camera.height - 1), columns.clip(0, own.camera.width - 1)
+    solid = own.solid[at]
+    empty, at = empty[solid], (at[0][solid], at[1][solid])
     if len(sampled[1]) < PLANE_POINTS or len(empty) == 0:
         return
     depth = _interpolated(empty, *sampled)
     if margin:
         free = ~_in_any_picture(unproject(camera, empty, depth), training)
     else:
-        depth, free = _supported_depth(view, camera, empty, depth, sampled[1], visibility)
+        depth, free = _supported_depth(filling, own, empty, depth, sampled[1], visibility)
     positions = unproject(camera, empty, depth)
     for centre, distance in filling.clearances:
         free &= np.linalg.norm(positions - centre, axis=1) > distance
     if not free.any():
         return
-    picture = load_image(folder / view.image, small.width, small.height)
     filling.positions.append(positions[free])
-    filling.colours.append(picture[at][free])
+    filling.colours.append(own.colours[at][free])
     filling.scales.append(SCALE * depth[free] / camera.fx)
 
 
 def _supported_depth(
-    view: View,
-    camera: Camera,
+    filling: _Filling,
+    own: SmallPicture,
     at: NDArray[np.float64],
     depth: NDArray[np.float64],
     depths: NDArray[np.float64],
     visibility: VisibilityConstraints,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """(depth [K], whether to fill [K]): positions without support are moved to the far end of the
-    photograph's `depths`, if no other photograph contradicts that."""
-    positions = unproject(camera, at, depth)
-    supported = visibility.supported(positions, view.name)
+    photograph's `depths`, or to where the colours of other photographs contradict that less, if no
+    points of another photograph do."""
+    positions = unproject(own.camera, at, depth)
+    supported = visibility.supported(positions, own.name)
     supported &= visibility.close_to_points(positions)
-    far = float(np.percentile(depths, FAR_PERCENTILE))
-    moved = np.where(supported, depth, np.maximum(depth, far))
-    filled = supported.copy()
-    rows = np.flatnonzero(~supported & (moved > depth))
-    _, occluding = visibility.count(unproject(camera, at[rows], moved[rows]), view.name)
+    moved, filled = depth.copy(), supported.copy()
+    rows = np.flatnonzero(~supported)
+    far = np.maximum(depth[rows], np.percentile(depths, FAR_PERCENTILE))
+    others = [picture for picture in filling.pictures.values() if picture is not own]
+    moved[rows] = depths_by_colour(own, others, at[rows], depth[rows], far)
+    _, occluding = visibility.count(unproject(own.camera, at[rows], moved[rows]), own.name)
     filled[rows] = occluding == 0
     return moved, filled
 
