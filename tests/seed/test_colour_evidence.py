@@ -69,7 +69,7 @@ def test_what_lies_behind_points_says_nothing_and_what_hides_them_contradicts(
     xy = random.uniform(-6, 6, (4000, 2))
     screen = np.c_[xy, np.full(len(xy), WALL)]
     (picture,) = pictures(tmp_path, (0.0,), screen)
-    grey = np.array([GREY], np.float32) / 255
+    grey = (np.array([GREY]) / 255).astype(np.float32)
     assert picture.evidence(np.array([[2.0, 0.0, WALL]]), grey) == 1
     assert picture.evidence(np.array([[2.0, 0.0, 1.5 * WALL]]), grey) == 0
     assert picture.evidence(np.array([[1.0, 0.0, 0.5 * WALL]]), grey) < 0
@@ -79,7 +79,7 @@ def test_what_lies_behind_points_says_nothing_and_what_hides_them_contradicts(
 def test_masked_cells_say_nothing(tmp_path: Path) -> None:
     (picture,) = pictures(tmp_path, (0.0,))
     masked = replace(picture, solid=np.zeros_like(picture.solid))
-    red = np.array([RED, RED], np.float32) / 255
+    red = (np.array([RED, RED]) / 255).astype(np.float32)
     at = np.array([[0.0, 0.0, WALL], [2.0, 0.0, WALL]])
     assert picture.evidence(at, red)[0] == 1
     assert picture.evidence(at, red)[1] < 0

@@ -10,7 +10,8 @@ from PIL import Image
 from stages.base.stage import Report
 from stages.scene import Camera, Reconstruction, View, look_at
 from stages.seed import stage as seed
-from stages.seed.empty_cells import CELLS, MARGIN, fill_cells
+from stages.seed.colour_evidence import CELLS
+from stages.seed.empty_cells import MARGIN, fill_cells
 from stages.seed.settings import SeedSettings
 
 WIDTH, HEIGHT = 80, 60
