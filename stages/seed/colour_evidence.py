@@ -17,13 +17,12 @@ from numpy.typing import NDArray
 from stages.scene import Camera, View
 from stages.scene.pictures import load_image, mask_of
 from stages.seed.projection import cells, unproject, visible_points
+from stages.seed.visibility import DEPTH_TOLERANCE, SUPPORT_RATIO
 
 CELLS = 32  # along the longer side of a photograph
 SOLID = 250  # of 255: least mean of the mask in a cell
 SIMILAR = 0.1  # largest difference of a channel, of colours in 0..1
 DIFFERENT = 0.2  # a larger one contradicts
-AGAINST = 4  # photographs that must agree for one that contradicts
-DEPTH_TOLERANCE = 0.1  # relative
 # Depths that are tried, as factors of the first one: farther ones before nearer ones, since of
 # equally good ones the first is taken, and too near is worse than too far.
 FACTORS = (1.0, *(2 ** (k / 2) for k in range(1, 7)), *(2 ** (-k / 2) for k in range(1, 7)))
@@ -63,8 +62,8 @@ class SmallPicture:
         self, positions: NDArray[np.float64], colours: NDArray[np.float32]
     ) -> NDArray[np.int64]:
         """[K] whether the photograph shows colours [K, 3] at positions [K, 3]: 1 if it does,
-        -AGAINST if it shows another colour or something behind the position, 0 if it does not show
-        the position or the difference is between the two."""
+        -SUPPORT_RATIO if it shows another colour or something behind the position, 0 if it does not
+        show the position or the difference is between the two."""
         found = np.zeros(len(positions), np.int64)
         rows, pixels, depths = visible_points(self.camera, positions)
         at = cells(pixels)
@@ -73,7 +72,7 @@ class SmallPicture:
         before = (ratio > 0) & (ratio < 1 - DEPTH_TOLERANCE)
         difference = np.abs(self._around(*at) - colours[rows]).max(-1).min(0)
         found[rows[shown & ~before & (difference < SIMILAR)]] = 1
-        found[rows[shown & (before | (difference > DIFFERENT))]] = -AGAINST
+        found[rows[shown & (before | (difference > DIFFERENT))]] = -SUPPORT_RATIO
         return found
 
     def _around(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float32]:
@@ -92,7 +91,7 @@ def depths_by_colour(
     first: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """[K] depths at which other photographs contradict cells least: the first one of each where
-    at most one in AGAINST + 1 of the photographs that tell contradicts it.
+    at most one in SUPPORT_RATIO + 1 of the photographs that tell contradicts it.
 
     Args:
         own: the photograph.

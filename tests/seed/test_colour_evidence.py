@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from stages.scene import Camera, View, look_at
-from stages.seed.colour_evidence import FACTORS, SmallPicture, depths_by_colour
+from stages.seed.colour_evidence import SmallPicture, depths_by_colour
 from stages.seed.projection import pixel_centres
 
 WIDTH, HEIGHT = 320, 240
@@ -44,7 +44,7 @@ def test_a_cell_moves_to_where_other_photographs_show_its_colour(
     tmp_path: Path, first: float
 ) -> None:
     found = depths(pictures(tmp_path, (0.0, -1.5, 1.5, 3.0)), 0.0, first)
-    np.testing.assert_allclose(found, WALL, rtol=0.2)
+    np.testing.assert_allclose(found, WALL, rtol=0.2)  # half of the step of sqrt(2) between depths
 
 
 def test_what_nobody_contradicts_stays(tmp_path: Path) -> None:
@@ -101,7 +101,25 @@ def test_the_same_in_other_units_and_another_world(tmp_path: Path) -> None:
     )
 
 
-def test_the_first_depth_is_tried_first_and_farther_ones_before_nearer_ones() -> None:
-    assert FACTORS[0] == 1.0
-    far = [factor > 1 for factor in FACTORS[1:]]
-    assert far == sorted(far, reverse=True)
+class Nothing:
+    """A photograph that contradicts one depth and says nothing of others."""
+
+    name = "nothing"
+
+    def __init__(self, depth: float) -> None:
+        self.depth = depth
+
+    def evidence(self, positions: np.ndarray, _colours: np.ndarray) -> np.ndarray:
+        return np.where(np.isclose(positions[:, 2], self.depth), -1, 0)
+
+
+def test_of_equally_good_depths_a_farther_one_is_taken(tmp_path: Path) -> None:
+    found = depths([*pictures(tmp_path, (0.0,)), Nothing(3.0)], 0.0, 3.0)  # type: ignore[list-item]
+    assert (found > 3.0).all()
+
+
+def test_what_every_depth_contradicts_alike_stays(tmp_path: Path) -> None:
+    """Photographs from one place see all depths of a cell at one pixel."""
+    own, other = pictures(tmp_path, (0.0, 0.0))
+    other = replace(other, colours=np.zeros_like(other.colours))
+    np.testing.assert_array_equal(depths([own, other], 0.0, 3.0), 3.0)
