@@ -23,12 +23,13 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import rename, sync_folder
 from stages.raster.backends import backend_of
+from stages.train.average import ParameterAverage
 from stages.train.clock import Elapsed
 from stages.train.history import HistoryEntry
 from stages.train.optimiser import Model
 
 FILE_NAME = "checkpoint.bin"
-MAGIC = b"SPLATC15"
+MAGIC = b"SPLATC16"
 _PREVIOUS = "checkpoint-previous.bin"
 _TEMPORARY = FILE_NAME + ".tmp"
 _CHUNK_BYTES = 1 << 20
@@ -68,6 +69,7 @@ class TrainingState:
         provenance: one entry for each change of backend or device.
         refinement: of cameras, see `camera_refinement`; None where they stay as they are.
         transient: for each training view [h, w] the parts that show what moved.
+        average: of the parameters over the last steps.
     """
 
     step: int
@@ -77,15 +79,19 @@ class TrainingState:
     provenance: list[Provenance]
     refinement: dict[str, Any] | None = None
     transient: list[NDArray[np.bool_]] = field(default_factory=list)
+    average: ParameterAverage = field(default_factory=ParameterAverage)
 
 
 def save_checkpoint(folder: Path, model: Model, state: TrainingState) -> None:
     """Write the checkpoint, once it is complete, under its name; the one before it is kept."""
     path, temporary = folder / FILE_NAME, folder / _TEMPORARY
     with temporary.open("w+b") as file:
-        header = json.dumps(dataclasses.asdict(state), default=_as_rows).encode()
+        average = state.average
+        written = dataclasses.asdict(dataclasses.replace(state, average=ParameterAverage()))
+        written["average"] = average.count, len(average.arrays)
+        header = json.dumps(written, default=_as_rows).encode()
         file.write(MAGIC + len(header).to_bytes(8, "little") + header)
-        for array in vars(model).values():
+        for array in (*vars(model).values(), *average.arrays):
             npy.write_array(file, array, allow_pickle=False)
         file.seek(0)
         file.write(hashlib.file_digest(file, "sha256").digest())
@@ -146,6 +152,9 @@ def _read(file: BinaryIO) -> tuple[Model, TrainingState]:
     header["history"] = [HistoryEntry(**entry) for entry in header["history"]]
     header["times"] = [Elapsed(**entry) for entry in header["times"]]
     header["provenance"] = [Provenance(**entry) for entry in header["provenance"]]
+    count, averaged = header["average"]
+    means = [npy.read_array(file, allow_pickle=False) for _ in range(averaged)]
+    header["average"] = ParameterAverage(count, means)
     header["transient"] = [np.array(rows, np.bool_) for rows in header["transient"]]
     state = TrainingState(**header | {"plan": tuple(header["plan"])})
     return Model(*(np.ascontiguousarray(a) for a in arrays)), state

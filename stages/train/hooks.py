@@ -16,6 +16,7 @@ from stages.evaluate.evaluation import EvaluationView, evaluate, evaluation_subs
 from stages.raster.backends import backend_of, rasteriser_of
 from stages.raster.draw import rendering_of
 from stages.scene import Camera, Splats
+from stages.train.average import AVERAGED_FROM, PARTS, ParameterAverage
 from stages.train.colour_refit import ColourRefit, needs_colour_refit
 from stages.train.density import (
     AdaptiveDensity,
@@ -56,6 +57,7 @@ def step_hooks(trainer: Trainer, start: Splats) -> list[StepHook]:
     free_space = known_free_space(start.means, [v.levels[-1].camera for v in task.views])
     return [
         Transients(),
+        Averaging(),
         FloaterRemoval(free_space),
         Densification(density),
         Sparsification(start, density),
@@ -91,13 +93,29 @@ class Transients:
 
 
 @dataclass(frozen=True)
+class Averaging:
+    """Averages the parameters over the end of the run, see `average`."""
+
+    def after_step(self, trainer: Trainer, step: int) -> None:
+        schedule = trainer.schedule
+        if schedule.share(step) <= AVERAGED_FROM or not schedule.passes(step, PARTS):
+            return
+        model = trainer.model.on_host()
+        trainer.average.add(model)
+        if step == schedule.steps:
+            trainer.replace_model(trainer.average.written_to(model))
+            trainer.average = ParameterAverage()
+
+
+@dataclass(frozen=True)
 class FloaterRemoval:
-    """Removes floaters a few times during the run, see `free_space`."""
+    """Removes floaters a few times during the run, see `free_space`, but while an average is made,
+    which needs the same splats."""
 
     free_space: FreeSpace
 
     def after_step(self, trainer: Trainer, step: int) -> None:
-        if trainer.schedule.passes(step, FLOATER_REMOVALS):
+        if trainer.schedule.passes(step, FLOATER_REMOVALS) and not trainer.average.count:
             model = trainer.model
             trainer.replace_model(model.take(~model.in_free_space(self.free_space)))
 

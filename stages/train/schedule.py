@@ -3,7 +3,8 @@
 The published schedule has 30,000 steps. Its events are scaled to the number of steps of the run,
 which may change during the run. Unlike the published one, it never resets opacities, draws at half
 the size in the first fifth and at several sizes after densification, raises the learning rates of
-short runs, lets all of them decay, and bounds the number of splats by a budget that rises linearly.
+short runs, lets all of them decay, but less far, as the last steps are averaged (`average`), and
+bounds the number of splats by a budget that rises linearly.
 Steps count from 0.
 """
 
@@ -16,7 +17,8 @@ import numpy as np
 from stages.train.optimiser import LearningRates
 
 PUBLISHED_STEPS = 30_000
-MEANS_LR, MEANS_LR_END = 1.6e-4, 1.6e-6  # x scene extent: at the first and at the last step
+# x scene extent, at the first and at the last step. Published: 1.6e-6 at the last.
+MEANS_LR, MEANS_LR_END = 1.6e-4, 6.4e-6
 DENSIFICATION_END = 0.5  # share of the run in which the model is densified
 # A run that is n times shorter than the published one, at most MOST_SHORTENED times, multiplies its
 # learning rates by n to these powers (docs/experiments/densification.md).
@@ -24,7 +26,7 @@ MOST_SHORTENED = 20.0
 RATES_POWER = 0.6  # all, but that of the means at the end
 MEANS_END_POWER = 1.2
 # Learning rates decay from this share of the run on, to this share of their value.
-RATE_DECAY_FROM, RATE_DECAY_END = 0.6, 0.1
+RATE_DECAY_FROM, RATE_DECAY_END = 0.6, 0.4
 MIN_DENSIFY_INTERVAL = 50  # steps: fewer see too little of the scene
 SCALES = (0.125, 0.25, 0.5, 1.0)  # of the images' sides
 EIGHTH, QUARTER, HALF, FULL = range(len(SCALES))

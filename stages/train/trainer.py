@@ -21,6 +21,7 @@ from stages.raster.backends import AUTO
 from stages.raster.definition import RasterSettings
 from stages.raster.smoothing import smoothing_widths
 from stages.scene import TRANSPARENT, Camera, DrawSettings, Splats
+from stages.train.average import ParameterAverage
 from stages.train.camera_refinement import STARTS, CameraRefinement
 from stages.train.cap import Cap, lower_cap, most_opaque
 from stages.train.checkpoint import (
@@ -111,6 +112,7 @@ class Trainer:
     history: History = field(init=False, default_factory=History)
     provenance: list[Provenance] = field(init=False, default_factory=list)
     transient: list[NDArray[np.bool_]] = field(init=False, default_factory=list)
+    average: ParameterAverage = field(init=False, default_factory=ParameterAverage)
     _random_background: bool = field(init=False)
 
     def __post_init__(self) -> None:
@@ -130,6 +132,7 @@ class Trainer:
         else:
             model, state = most_opaque(saved[0], self.cap.splats), saved[1]
             step, self.provenance, self.transient = state.step, state.provenance, state.transient
+            self.average = state.average
             *times, elapsed = state.times
             self.history, self.clock = History(state.history, times), Clock(elapsed)
             self.schedule = self.schedule.as_planned(*state.plan)
@@ -257,6 +260,7 @@ class Trainer:
             provenance=self.provenance,
             refinement=None if self.refinement is None else self.refinement.state(),
             transient=self.transient,
+            average=self.average,
         )
         save_checkpoint(self.task.folder, self.model.on_host(), state)
 
