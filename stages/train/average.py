@@ -36,8 +36,9 @@ class ParameterAverage:
         if not self.count or len(self.arrays[0]) != len(model):
             self.count, self.arrays = 0, [np.zeros_like(array) for array in model.arrays]
         self.count += 1
-        for mean, array in zip(self.arrays, model.arrays, strict=True):
-            mean += (array - mean) * np.float32(1.0 / self.count)
+        with np.errstate(over="ignore", invalid="ignore"):  # such splats are left out at the end
+            for mean, array in zip(self.arrays, model.arrays, strict=True):
+                mean += (array - mean) * np.float32(1.0 / self.count)
 
     def written_to(self, model: Model) -> Model:
         """The model, with its parameters replaced by the average of the models so far."""

@@ -57,6 +57,13 @@ def test_models_are_not_changed_by_being_averaged() -> None:
         assert a.tobytes() == b.tobytes()
 
 
+def test_a_splat_that_is_not_finite_spoils_no_other() -> None:
+    broken = model(2)
+    broken.means[3], broken.sh[4] = np.inf, np.nan
+    found = average_of([model(1), broken, model(3)]).written_to(model(9))
+    np.testing.assert_array_equal(np.flatnonzero(~found.finite()), [3, 4])
+
+
 def test_with_fewer_splats_it_begins_anew() -> None:
     average = average_of([model(1), model(2), model(3, splats=10)])
     assert average.count == 1
