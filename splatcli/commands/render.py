@@ -47,7 +47,8 @@ def render(
     """Draw the splats: from a photograph's camera, or as a film along a path.
 
     Frames that are in the folder already are written again. Depth is z in world units, 0 where
-    there is nothing. Pictures smaller than those of training are drawn larger and averaged.
+    there is nothing. Pictures of two thirds of the size in training and less are drawn larger and
+    averaged.
     """
     wanted = changed(RenderOptions(), given_only(given))
     kind = wanted.kind(out)
@@ -58,7 +59,7 @@ def render(
     _check_memory(max(cameras, key=lambda camera: camera.width * camera.height))
     console.note_compiling()
     draw = renderer(splats, backend=backend or results.backend_of_run(run))
-    draw = supersampled(draw, splats.draw_settings.side)
+    draw = supersampled(draw, splats.draw_settings.side or results.training_side_of(run))
     rate = _draw_all(draw, cameras, _sink(out, wanted, kind, cameras))
     facts: dict[str, Any] = {
         "frames": len(cameras),

@@ -55,11 +55,12 @@ def rendering_of(forward: Forward) -> Rendering:
 def supersampled(draw: Callable[[Camera], Rendering], side: int) -> Callable[[Camera], Rendering]:
     """A function that draws as `draw` does, with smooth small pictures.
 
-    A picture whose longer side is below `side` pixels is drawn larger, by a whole number, and its
-    colour and alpha are averaged over the area of each pixel.
+    A picture is drawn larger by the whole number of times that brings its longer side nearest to
+    `side`, and its colour and alpha are averaged over the area of each pixel.
 
     A splat of a fraction of a pixel is too faint and too wide in a direct drawing: the low-pass
     filter widens it, and compensation treats it alone, not with the neighbours that fill the pixel.
+    Drawn larger than in training it is too narrow, and shows gaps (docs/experiments/drawing.md).
     Depths are those of one sample in each pixel, because a mean over an edge is on no surface.
 
     Args:
@@ -68,7 +69,7 @@ def supersampled(draw: Callable[[Camera], Rendering], side: int) -> Callable[[Ca
     """
 
     def draw_larger(camera: Camera) -> Rendering:
-        factor = -(-side // max(camera.width, camera.height))
+        factor = int(side / max(camera.width, camera.height) + 0.5)
         if factor <= 1:
             return draw(camera)
         height, width = camera.height, camera.width

@@ -119,6 +119,12 @@ def views_of(pipeline: Pipeline | None) -> tuple[View, ...]:
     return tuple(sorted(pipeline.load("sfm").views, key=lambda view: view.name))
 
 
+def training_side_of(pipeline: Pipeline | None) -> int:
+    """Longer side of the largest held-out picture at the size of training, pixels; 0 if unknown."""
+    trained = pipeline.manifest("train") if pipeline is not None else None
+    return int(trained.metrics.get("evaluated_side_px", 0)) if trained is not None else 0
+
+
 def run_around(file: Path | None) -> Pipeline | None:
     """The run whose export folder a file lies in: its cameras fit the file."""
     if file is None or not runfolder.is_run_folder(file.absolute().parent.parent):

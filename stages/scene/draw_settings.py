@@ -23,8 +23,8 @@ class DrawSettings:
     Args:
         near: a splat is drawn if the z of its centre is larger; world units. 0 if unknown, as in
             files of other programs.
-        side: longer side of the photographs in training and evaluation, pixels; 0 if there were
-            none.
+        side: longer side of the largest picture in training and evaluation, pixels; 0 if there
+            were none.
         background: grey level behind everything, 0 to 1: black, or white for cut-out photographs.
         light: whether photographs are corrected to their median light (`scene.light`) first.
         antialias: whether opacities are reduced by as much as the rasteriser's dilation enlarges
@@ -49,8 +49,15 @@ def draw_settings_of(
     light: bool = False,
     antialias: bool = False,
 ) -> DrawSettings:
-    """How splats trained on these views are drawn, by the training views among them. The others: as
-    in `DrawSettings`."""
+    """How splats trained on these views are drawn, by the training views among them.
+
+    Args:
+        views: of the capture.
+        side: that photographs are made smaller to, pixels; 0 for none.
+        light, antialias: as in `DrawSettings`.
+    """
+    if side:
+        side = min(side, max((max(v.camera.width, v.camera.height) for v in views), default=side))
     cut_out = any(view.outside == TRANSPARENT for view in views)
     near = NEAR_SHARE * scene_extent(split_held_out(views)[0])
     return DrawSettings(near, side, float(cut_out), light, antialias)

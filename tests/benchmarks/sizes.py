@@ -9,8 +9,9 @@ also the size of its .ply and the CPU seconds of training.
 `--presets preview standard` first processes the sample into a run of each below `--out`, or goes on
 with those.
 
-Splats are drawn as they were trained, and with `--drawing plain` or `--drawing antialiased` as a
-viewer does that does not compensate opacities, or does.
+Splats are drawn as they were trained, with `--drawing plain` or `--drawing antialiased` as a viewer
+does that does not compensate opacities, or does, and with `--drawing averaged` as `splat render`
+does: small pictures larger, then averaged.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from rich.table import Table
 
 from splatcli.folders import load_target
 from stages.evaluate.evaluation import EvaluationView, evaluate_at_sizes
-from stages.raster.draw import raster_settings_of, renderer
+from stages.raster.draw import raster_settings_of, renderer, supersampled
 from stages.run import results
 from stages.run.pipeline import Pipeline
 from stages.scene import Splats
@@ -36,7 +37,7 @@ from tests.benchmarks.sample_test_views import HIGHER, PINHOLE, evaluation_views
 
 SIDES = (120, 240, 320, 480, 640)
 VIEWS = {"all": slice(None), "between, closer": slice(-HIGHER), "higher": slice(-HIGHER, None)}
-DRAWINGS = {"trained": None, "plain": False, "antialiased": True}
+DRAWINGS = {"trained": None, "averaged": None, "plain": False, "antialiased": True}
 
 
 def psnr_at(
@@ -47,6 +48,8 @@ def psnr_at(
     if compensates is not None:
         settings = replace(settings, antialias=compensates)
     draw = renderer(splats, settings)
+    if drawing == "averaged":
+        draw = supersampled(draw, splats.draw_settings.side)
     sizes = {str(side): side / PINHOLE.width for side in sides}
     found = evaluate_at_sizes(lambda camera: draw(camera).image, views, sizes)
     return {int(side): [score.psnr_db for score in same] for side, same in found.items()}

@@ -7,7 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from stages.raster.definition import Rendering
 from stages.raster.draw import render, renderer, supersampled
+from stages.scene import Camera
 from stages.scene.draw_settings import DrawSettings
 from tests import scenes
 
@@ -45,3 +47,19 @@ def test_a_small_picture_is_the_mean_of_one_as_large_as_those_of_training() -> N
     assert found.median_depth.shape == found.alpha.shape == (6, 8)
     assert found.alpha.min() > 0.99 > draw(small).alpha.max()
     assert supersampled(draw, 8)(small).image.tolist() == draw(small).image.tolist()
+
+
+@pytest.mark.parametrize(("side", "times"), [(0, 1), (9, 1), (11, 1), (12, 2), (19, 2), (21, 3)])
+def test_a_small_picture_is_drawn_at_the_multiple_nearest_to_training(
+    side: int, times: int
+) -> None:
+    """Of 8 pixels. Larger than in training splats are narrower than they were trained to be."""
+    drawn = []
+
+    def draw(camera: Camera) -> Rendering:
+        drawn.append(camera.width)
+        alpha, depth, median = np.zeros((3, camera.height, camera.width), np.float32)
+        return Rendering(np.stack([alpha] * 3, -1), alpha, depth, median, 0)
+
+    assert supersampled(draw, side)(scenes.camera(8, 6, focal=7.5)).image.shape == (6, 8, 3)
+    assert drawn == [8 * times]

@@ -82,3 +82,9 @@ def test_without_points_in_any_picture_the_cameras_tell(points):
 
 def test_cameras_at_one_place_have_the_smallest_extent() -> None:
     assert scene_extent(standing_at(np.ones((4, 3)))) == 1e-6
+
+
+@pytest.mark.parametrize(("side", "kept"), [(0, 0), (40, 40), (800, 64)])
+def test_pictures_in_training_are_no_larger_than_the_photographs(side, kept):
+    """Of 64 by 48 pixels. 0 stands for no training."""
+    assert draw_settings_of(standing_at(np.zeros((2, 3))), side).side == kept
