@@ -2,9 +2,9 @@
 
 The published schedule has 30,000 steps. Its events are scaled to the number of steps of the run,
 which may change during the run. Unlike the published one, it never resets opacities, draws at half
-the size in the first fifth and at several sizes after densification, raises the learning rates of
-short runs, lets all of them decay, but less far, as the last steps are averaged (`average`), and
-bounds the number of splats by a budget that rises linearly.
+the size in the first fifth and densifies only then, draws at several sizes after densification,
+raises the learning rates of short runs, lets all of them decay, but less far, as the last steps are
+averaged (`average`), and bounds the number of splats by a budget that rises linearly.
 Steps count from 0.
 """
 
@@ -30,7 +30,9 @@ RATE_DECAY_FROM, RATE_DECAY_END = 0.6, 0.4
 MIN_DENSIFY_INTERVAL = 50  # steps: fewer see too little of the scene
 SCALES = (0.125, 0.25, 0.5, 1.0)  # of the images' sides
 EIGHTH, QUARTER, HALF, FULL = range(len(SCALES))
-HALF_SIZE_END = 0.2  # share of the run that draws small images: they are cheap and smooth
+# Share of the run that draws small images, which are cheap and smooth, and does not densify: many
+# small splats fit every photograph wherever they are (docs/experiments/densification.md).
+HALF_SIZE_END = 0.2
 # `Schedule.since` of a run that starts from trained splats, without and with densification.
 LAST_PART, DENSIFYING_PART = (0, RATE_DECAY_FROM), (0, HALF_SIZE_END)
 # After densification, one of 20 steps each draws at an eighth, a quarter and half of the size, so
@@ -109,13 +111,14 @@ class Schedule:
         """Whether to densify once `step` is done."""
         interval = max(self._scaled(100), MIN_DENSIFY_INTERVAL)
         done = step + 1
-        starts, ends = 500 / PUBLISHED_STEPS, DENSIFICATION_END
-        return starts <= self.share(done) <= ends and done % interval == 0
+        densifying = HALF_SIZE_END <= self.share(done) <= DENSIFICATION_END
+        return densifying and done % interval == 0
 
     def budget(self, step: int, cap: int) -> int:
-        """Largest number of splats after `step`. It rises linearly to the cap, so that early, noisy
-        gradients do not use up what later, better ones need."""
-        share = min(1.0, self.share(step + 1) / DENSIFICATION_END)
+        """Largest number of splats after `step`. It rises linearly to the cap while the model is
+        densified, so that early, noisy gradients do not use up what later, better ones need."""
+        done = (self.share(step + 1) - HALF_SIZE_END) / (DENSIFICATION_END - HALF_SIZE_END)
+        share = min(1.0, max(0.0, done))
         return max(self.n_start, round(self.n_start + (cap - self.n_start) * share))
 
     def level(self, step: int) -> int:

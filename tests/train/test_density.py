@@ -18,7 +18,7 @@ from stages.train.density import (
     split_along_longest_axis,
 )
 from stages.train.optimiser import LearningRates, new_model
-from stages.train.schedule import Schedule
+from stages.train.schedule import FULL, HALF, MIN_DENSIFY_INTERVAL, Schedule
 
 VIEWS = 8
 
@@ -148,6 +148,19 @@ def test_the_schedule_scales_to_any_number_of_steps(steps):
         assert seen[:7] != seen[7:14]
 
 
+@pytest.mark.parametrize("steps", [200, 2000, 30_000])
+def test_splats_are_added_only_while_pictures_have_the_full_size(steps):
+    s = schedule(steps)
+    growing = [step for step in range(steps) if s.densifies_after(step)]
+    assert growing
+    assert {s.level(step + 1) for step in growing[:-1]} == {FULL}
+    assert all(s.level(step) == HALF for step in range(growing[0] - MIN_DENSIFY_INTERVAL))
+    budgets = [s.budget(step, 1000) for step in range(steps)]
+    assert set(budgets[: steps // 5]) == {s.n_start}
+    assert budgets == sorted(budgets)
+    assert budgets[steps // 2] == budgets[-1] == 1000
+
+
 def test_short_runs_raise_all_rates_and_that_of_the_means_at_the_end_most():
     published, short = schedule(30_000), schedule(3000)
     for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh_dc", "sh_rest"):
@@ -163,7 +176,5 @@ def test_the_full_schedule_has_its_published_events():
     assert s.rates(30_000).means == pytest.approx(4 * 1.6e-6 * 2.0)  # the end is averaged
     assert s.active_sh_degree(999) == 0
     assert s.active_sh_degree(1000) == 1
-    assert s.densifies_after(499)
-    assert s.densifies_after(599)
-    assert not s.densifies_after(550)
-    assert not s.densifies_after(399)
+    assert s.densifies_after(6099)
+    assert not s.densifies_after(6050)
