@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -18,7 +19,8 @@ from splatcli.options import given_only
 from splatcli.progress import counting
 from splatcli.render_options import RenderOptions
 from stages.base import memory
-from stages.base.errors import ResourceError
+from stages.base.errors import Interrupted, ResourceError
+from stages.base.interrupt import stop_on_signals
 from stages.base.settings import changed
 from stages.raster.definition import Rendering
 from stages.raster.draw import renderer, supersampled
@@ -130,10 +132,20 @@ def _draw_all(
     sink: AbstractContextManager[Callable[[Rendering], None]],
 ) -> float | None:
     """Draw and write all frames. Returns frames a second without the writing, from the second frame
-    on, because the first also compiles kernels and makes buffers; None for a single frame."""
-    seconds = []
-    with counting("frames", len(cameras)) as tick, sink as put:
+    on, because the first also compiles kernels and makes buffers; None for a single frame.
+
+    Raises Interrupted between two frames after Ctrl-C, which in a compiled kernel would be an error
+    of that kernel."""
+    seconds: list[float] = []
+    stop = threading.Event()
+    with (
+        stop_on_signals(stop, lambda: None),
+        counting("frames", len(cameras)) as tick,
+        sink as put,
+    ):
         for camera in cameras:
+            if stop.is_set():
+                raise Interrupted(f"stopped after {len(seconds)} of {len(cameras)} frames")
             begun = time.perf_counter()
             drawn = draw(camera)
             seconds.append(time.perf_counter() - begun)
