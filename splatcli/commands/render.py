@@ -134,8 +134,8 @@ def _draw_all(
     """Draw and write all frames. Returns frames a second without the writing, from the second frame
     on, because the first also compiles kernels and makes buffers; None for a single frame.
 
-    Raises Interrupted between two frames after Ctrl-C, which in a compiled kernel would be an error
-    of that kernel."""
+    Raises Interrupted between two frames after Ctrl-C: in a compiled kernel a KeyboardInterrupt may
+    come back as another error."""
     seconds: list[float] = []
     stop = threading.Event()
     with (

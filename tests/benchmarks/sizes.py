@@ -41,15 +41,25 @@ DRAWINGS = {"trained": None, "averaged": None, "plain": False, "antialiased": Tr
 
 
 def psnr_at(
-    splats: Splats, views: Sequence[EvaluationView], sides: Sequence[int], drawing: str = "trained"
+    splats: Splats,
+    views: Sequence[EvaluationView],
+    sides: Sequence[int],
+    drawing: str = "trained",
+    trained_side: int = 0,
 ) -> dict[int, list[float]]:
-    """PSNR of each view by longer side. views: at PINHOLE's size, in the world of `splats`."""
+    """PSNR of each view by longer side.
+
+    Args:
+        views: at PINHOLE's size, in the world of `splats`.
+        drawing: one of DRAWINGS.
+        trained_side: longer side of the pictures in training, pixels, for "averaged".
+    """
     settings, compensates = raster_settings_of(splats), DRAWINGS[drawing]
     if compensates is not None:
         settings = replace(settings, antialias=compensates)
     draw = renderer(splats, settings)
     if drawing == "averaged":
-        draw = supersampled(draw, splats.draw_settings.side)
+        draw = supersampled(draw, trained_side)
     sizes = {str(side): side / PINHOLE.width for side in sides}
     found = evaluate_at_sizes(lambda camera: draw(camera).image, views, sizes)
     return {int(side): [score.psnr_db for score in same] for side, same in found.items()}
@@ -88,8 +98,9 @@ def main() -> None:
             raise SystemExit(f"{target} lies in no run: the cameras of the test views are unknown.")
         settings = replace(splats.draw_settings, side=PINHOLE.width)
         views = evaluation_views(given.out / "test_views", run.load("sfm"), settings)
+        trained_side = splats.draw_settings.side or results.training_side_of(run)
         for drawing in given.drawing:
-            found = psnr_at(splats, views, given.sides, drawing)
+            found = psnr_at(splats, views, given.sides, drawing, trained_side)
             for name, chosen in VIEWS.items():
                 same = [psnr_db[chosen] for psnr_db in found.values()]
                 cells = [f"{np.mean(psnr_db):.2f} / {min(psnr_db):.2f}" for psnr_db in same]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+from contextlib import nullcontext
 from pathlib import Path
 
 import cv2
@@ -12,9 +13,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from splatcli.commands.render import _draw_all
 from stages import formats
 from stages.base import memory
+from stages.base.errors import Interrupted
 from stages.cameras import nerfstudio
+from stages.raster.definition import Rendering
 from stages.raster.draw import render
 from stages.run import results
 from stages.scene import Camera, View, look_at
@@ -214,3 +218,19 @@ def test_ctrl_c_leaves_no_half_film(scene: Path, tmp_path: Path) -> None:
         rendering.communicate(timeout=30)
         assert rendering.returncode == 130
     assert os.listdir(tmp_path) == ["a.ply"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends the signal of Ctrl-C")
+def test_ctrl_c_stops_between_two_frames() -> None:
+    """The frame that is being drawn is finished and written."""
+    written: list[Rendering] = []
+
+    def draw(camera: Camera) -> Rendering:
+        signal.raise_signal(signal.SIGINT)
+        alpha, depth, median = np.zeros((3, camera.height, camera.width), np.float32)
+        return Rendering(np.stack([alpha] * 3, -1), alpha, depth, median, 0)
+
+    tall = Camera(60, 90, 50.0, 50.0, 30.0, 45.0, np.eye(4))
+    with pytest.raises(Interrupted, match="1 of 3 frames"):
+        _draw_all(draw, [tall] * 3, nullcontext(written.append))
+    assert len(written) == 1

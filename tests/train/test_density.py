@@ -18,7 +18,7 @@ from stages.train.density import (
     split_along_longest_axis,
 )
 from stages.train.optimiser import LearningRates, new_model
-from stages.train.schedule import FULL, HALF, MIN_DENSIFY_INTERVAL, Schedule
+from stages.train.schedule import FULL, Schedule
 
 VIEWS = 8
 
@@ -154,7 +154,6 @@ def test_splats_are_added_only_while_pictures_have_the_full_size(steps):
     growing = [step for step in range(steps) if s.densifies_after(step)]
     assert growing
     assert {s.level(step + 1) for step in growing[:-1]} == {FULL}
-    assert all(s.level(step) == HALF for step in range(growing[0] - MIN_DENSIFY_INTERVAL))
     budgets = [s.budget(step, 1000) for step in range(steps)]
     assert set(budgets[: steps // 5]) == {s.n_start}
     assert budgets == sorted(budgets)
