@@ -13,30 +13,43 @@ from stages.scene.framing import median_depth
 
 _STEEPEST_DEG = 80.0  # elevation; from straight above, left and right are undefined
 _INSIDE = 0.9  # of an arc: its ends are seen by a single view only
+_SPREAD_RAD = np.radians(20.0)  # of the weights of cameras around the direction of a frame
 
 
 def orbit(cameras: Sequence[Camera], splats: Splats, frames: int) -> tuple[Camera, ...]:
-    """A level turn around what `cameras` look at, at their median distance and elevation.
+    """A turn around what `cameras` look at, at the distance and elevation of the cameras that look
+    from there: where they stood nearer because of a wall, so does the path.
 
     If the cameras leave out much of the turn, the path goes to and fro over the arc that they
     cover. It is a loop: the frame after the last equals the first.
     """
     middle = focus(cameras, splats)
-    away = np.array([camera.centre for camera in cameras]) - middle
-    distance = max(float(np.median(np.linalg.norm(away, axis=1))), 1e-6)
-    limit = np.radians(_STEEPEST_DEG)
-    heights = np.arctan2(-away[:, 1], np.hypot(away[:, 0], away[:, 2]))
-    height = float(np.clip(np.median(heights), -limit, limit))
     start, half = arc_seen(cameras, splats)
     phase = 2 * np.pi * np.arange(frames) / frames
     angles = start + (phase if half >= np.pi else half * np.sin(phase))
     lens = common_lens(cameras)
     made = []
-    for angle in angles:
+    for angle, (distance, height) in zip(angles, _stands(cameras, middle, angles), strict=True):
         ray = (np.cos(height) * np.sin(angle), -np.sin(height), np.cos(height) * np.cos(angle))
         eye = middle + distance * np.array(ray)
         made.append(replace(lens, world_to_camera=look_at(eye, middle)))
     return tuple(made)
+
+
+def _stands(
+    cameras: Sequence[Camera], middle: NDArray[np.float64], angles: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """[F, 2] the distance from `middle` and the elevation (radians) of the cameras in the
+    directions `angles` [F]: means that are weighted by von Mises distributions around these."""
+    away = np.array([camera.centre for camera in cameras]) - middle
+    distances = np.maximum(np.linalg.norm(away, axis=1), 1e-6)
+    limit = np.radians(_STEEPEST_DEG)
+    heights = np.arctan2(-away[:, 1], np.hypot(away[:, 0], away[:, 2])).clip(-limit, limit)
+    apart = angles[:, None] - np.arctan2(away[:, 0], away[:, 2])
+    weights = np.exp((np.cos(apart) - 1.0) / _SPREAD_RAD**2)
+    weights /= weights.sum(1, keepdims=True)
+    found: NDArray[np.float64] = weights @ np.stack([distances, heights], axis=1)
+    return found
 
 
 def arc_seen(cameras: Sequence[Camera], splats: Splats) -> tuple[float, float]:

@@ -16,7 +16,9 @@ from stages.viewer import camera_paths, orbit
 
 _TURN_S = 8.0  # the default duration of one turn around the scene
 _SHORTEST_S, _LONGEST_S = 4.0, 40.0  # default durations of other paths
-_SMOOTHING_S = 0.3  # standard deviation of the smoothing of hand-held cameras
+# Standard deviation of the smoothing of hand-held cameras, in the path's default duration: a film
+# of few frames goes the same way.
+_SMOOTHING_S = 0.3
 
 
 @dataclass(frozen=True)
@@ -122,15 +124,21 @@ def _past_views(cameras: list[Camera], splats: Splats, duration: Duration) -> li
             hint="Name the run folder, or choose --path orbit.",
         )
     cameras = [cameras[i] for i in camera_paths.tour(cameras, splats)]
-    frames = _SMOOTHING_S * duration.frames_per_second
-    smooth = camera_paths.smoothed_path(_interpolated(cameras, splats, duration), frames)
+    path = _interpolated(cameras, splats, duration)
+    smoothing = len(path) * _SMOOTHING_S / _default_s(cameras, splats)
+    smooth = camera_paths.smoothed_path(path, smoothing)
     return [camera_paths.levelled(camera) for camera in smooth]
 
 
 def _interpolated(cameras: list[Camera], splats: Splats, duration: Duration) -> list[Camera]:
-    default_s = _TURN_S * camera_paths.length_in_turns(cameras, splats)
-    frames = duration.frames_or(min(max(default_s, _SHORTEST_S), _LONGEST_S))
+    frames = duration.frames_or(_default_s(cameras, splats))
     return list(camera_paths.interpolated(cameras, splats, frames))
+
+
+def _default_s(cameras: list[Camera], splats: Splats) -> float:
+    """The default duration of a path through the cameras, seconds."""
+    turns = camera_paths.length_in_turns(cameras, splats)
+    return min(max(_TURN_S * turns, _SHORTEST_S), _LONGEST_S)
 
 
 def _read_cameras(path: str) -> tuple[list[Camera], tuple[str, ...]]:

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from stages.scene import Camera, look_at
+from stages.scene import Camera, View, look_at
 from stages.viewer.camera_paths import (
     interpolated,
     length_in_turns,
@@ -15,6 +15,7 @@ from stages.viewer.camera_paths import (
     smoothed_path,
     tour,
 )
+from stages.viewer.render_cameras import Duration, path_cameras
 from tests import scenes
 from tests.sfm.synthetic import random_rotation
 
@@ -153,6 +154,20 @@ def test_a_steady_path_ends_where_it_did_and_turns_corners_gently() -> None:
     far = max(np.linalg.norm(a.centre - b.centre) for a, b in zip(steady, hand, strict=True))
     assert far < 0.3
     assert len(smoothed_path(hand[:1], 6.0)) == 1
+
+
+def test_few_frames_go_the_same_way_past_the_photographs() -> None:
+    """Twelve frames of a turn lie on the film of 240, and so at the cameras' distance."""
+    ring = [camera((4 * np.sin(a), 0, 4 * np.cos(a))) for a in np.linspace(0, 2 * np.pi, 24)]
+    views = [View(f"{k}", f"{k}.jpg", seen) for k, seen in enumerate(ring)]
+    film, stills = (
+        np.array([c.centre for c in path_cameras("capture", SPLATS, views, Duration(n)).cameras])
+        for n in (240, 12)
+    )
+    assert len(stills) == 12
+    np.testing.assert_allclose(np.linalg.norm(stills[1:-1], axis=1), 4.0, atol=0.1)
+    apart = np.linalg.norm(stills[:, None] - film[None], axis=2).min(1)
+    assert apart.max() < 0.15
 
 
 def test_a_full_turn_is_one_turn_long() -> None:

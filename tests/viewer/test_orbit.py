@@ -1,4 +1,4 @@
-"""A turn around the scene keeps its distance, its height and its horizon."""
+"""A turn around the scene keeps the photographs' distance and height, and its horizon."""
 
 from __future__ import annotations
 
@@ -79,6 +79,22 @@ def test_a_turn_starts_at_the_first_camera_and_closes_without_a_jump() -> None:
     np.testing.assert_allclose(steps, steps[0])
     angles = np.unwrap(np.arctan2(*(ring - MIDDLE)[:, [0, 2]].T))
     assert np.ptp(angles) == pytest.approx(2 * np.pi * 35 / 36)
+
+
+def test_a_turn_is_nearer_and_higher_on_the_side_where_the_photographs_were() -> None:
+    """As in a courtyard: on one side a wall is 2 behind the subject, on the other 6."""
+    near = around(np.arange(-80, 81, 20), distance=2.0, slope_deg=40.0)
+    far = around(np.arange(100, 261, 20), distance=6.0, slope_deg=10.0)
+    frames = orbit(near + far, SPLATS, 4)  # from -80 degrees on
+    away = centres(frames) - MIDDLE
+    distances = np.linalg.norm(away, axis=1)
+    heights = np.degrees(np.arcsin(-away[:, 1] / distances))
+    assert distances[1] == pytest.approx(2.0, abs=0.05)  # at 10 degrees
+    assert distances[3] == pytest.approx(6.0, abs=0.05)
+    assert heights[1] == pytest.approx(40.0, abs=1.0)
+    assert heights[3] == pytest.approx(10.0, abs=1.0)
+    for frame in frames:
+        assert abs(frame.world_to_camera[0, 1]) < 1e-12
 
 
 @pytest.mark.parametrize("turned", [0.0, 100.0, 200.0])
