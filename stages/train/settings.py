@@ -135,7 +135,7 @@ class TrainSettings:
 
 
 PRESETS: dict[str, TrainSettings] = {
-    "preview": TrainSettings(steps=2000, train_side=480, sh_degree=1, max_splats=60_000),
+    "preview": TrainSettings(steps=2400, train_side=480, sh_degree=1, max_splats=60_000),
     "standard": TrainSettings(
         steps_per_view=150,
         train_side=800,
