@@ -114,7 +114,7 @@ class _BlockTraining:
         folders = self._blocks(seeds, coarse, cells, assigned, partition.margin(points))
         parts = self._parts(folders, cells, assigned)
         draw_settings = draw_settings_of(
-            self.whole.views, self.settings.train_side, light, self.settings.antialias
+            self.whole, self.settings.train_side, light, self.settings.antialias
         )
         crosses = partition.crosses_blocks(assigned)
         crossing = [v for v, across in zip(self.whole.views, crosses, strict=True) if across]

@@ -138,11 +138,11 @@ def read_file(file: Path, strict: bool = True) -> Splats:
     strict: whether a value that is not finite makes the file unreadable. Raises SplatError.
     """
     splats = read(file, strict=strict)
-    views = views_of(run_around(file))
-    if not views:
+    run = run_around(file)
+    if run is None or not views_of(run):
         return splats
     antialias = splats.draw_settings.antialias  # as the file says
-    return replace(splats, draw_settings=draw_settings_of(views, antialias=antialias))
+    return replace(splats, draw_settings=draw_settings_of(run.load("sfm"), antialias=antialias))
 
 
 def backend_of_run(pipeline: Pipeline | None) -> str:

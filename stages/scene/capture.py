@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
@@ -263,10 +263,16 @@ def training_extent(reconstruction: Reconstruction) -> float:
     the cameras of a phone held almost still say little about the size of the scene before them.
     Held-out views do not count.
     """
-    depths, views = [], split_held_out(reconstruction.views)[0]
-    for view in views:
+    seen = [float(np.median(depths)) for depths in depths_seen(reconstruction)]
+    extent = scene_extent(split_held_out(reconstruction.views)[0])
+    return max(extent, float(np.median(seen)) if seen else 0.0)
+
+
+def depths_seen(reconstruction: Reconstruction) -> Iterator[NDArray[np.float64]]:
+    """For each training view that sees points, their depths [K], world units. Points that others
+    hide count, too."""
+    for view in split_held_out(reconstruction.views)[0]:
         pixels, z = view.camera.project(reconstruction.points)
-        seen = z[(z > 0) & view.camera.shows(pixels)]
-        if len(seen):
-            depths.append(float(np.median(seen)))
-    return max(scene_extent(views), float(np.median(depths)) if depths else 0.0)
+        depths = z[(z > 0) & view.camera.shows(pixels)]
+        if len(depths):
+            yield depths

@@ -8,9 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.scene.camera import Camera
-from stages.scene.capture import TRANSPARENT, View, scene_extent, split_held_out
+from stages.scene.capture import (
+    TRANSPARENT,
+    Reconstruction,
+    depths_seen,
+    scene_extent,
+    split_held_out,
+)
 
 NEAR_SHARE = 0.01  # of the cameras' extent: photographs are not in focus nearer than that
+# Of the least depth that a photograph shows. What lies nearer to a camera is no part of the scene,
+# or a surface behind another photographer, a little out of place.
+NEAR_SHARE_OF_DEPTH = 0.2
+MISPLACED_PERCENT = 1.0  # of the points that a photograph shows
 # Of the diagonal of `_densest_half`, if there are no cameras. With this share, runs on six captures
 # get 0.4 to 2.8 times the near plane of their cameras.
 NEAR_SHARE_OF_HALF = 0.008
@@ -44,7 +54,7 @@ class DrawSettings:
 
 
 def draw_settings_of(
-    views: tuple[View, ...],
+    reconstruction: Reconstruction,
     side: int = 0,
     light: bool = False,
     antialias: bool = False,
@@ -52,15 +62,22 @@ def draw_settings_of(
     """How splats trained on these views are drawn, by the training views among them.
 
     Args:
-        views: of the capture.
         side: that photographs are made smaller to, pixels; 0 for none.
         light, antialias: as in `DrawSettings`.
     """
+    views = reconstruction.views
     if side:
         side = min(side, max((max(v.camera.width, v.camera.height) for v in views), default=side))
     cut_out = any(view.outside == TRANSPARENT for view in views)
-    near = NEAR_SHARE * scene_extent(split_held_out(views)[0])
-    return DrawSettings(near, side, float(cut_out), light, antialias)
+    return DrawSettings(near_plane(reconstruction), side, float(cut_out), light, antialias)
+
+
+def near_plane(reconstruction: Reconstruction) -> float:
+    """The near plane of splats trained on these views, world units: in front of all that the
+    training views show, and no nearer than a share of the cameras' extent."""
+    least = [float(np.percentile(z, MISPLACED_PERCENT)) for z in depths_seen(reconstruction)]
+    extent = scene_extent(split_held_out(reconstruction.views)[0])
+    return max(NEAR_SHARE * extent, NEAR_SHARE_OF_DEPTH * min(least, default=0.0))
 
 
 def near_plane_of(means: NDArray[np.floating]) -> float:

@@ -120,7 +120,7 @@ def _warn_of_held_out(photographs: int, were: str, report: Report) -> None:
 def _views(reconstruction: Reconstruction, side: int, report: Report) -> Sequence[EvaluationView]:
     """Some training views with their photographs, at most `side` pixels long."""
     training, _ = split_held_out(reconstruction.views)
-    settings = replace(draw_settings_of(reconstruction.views), side=side)
+    settings = replace(draw_settings_of(reconstruction), side=side)
     chosen = evenly_spaced(training, _VIEWS)
     return load_evaluation_views(reconstruction.folder, chosen, settings, report.stop_requested)
 
@@ -143,7 +143,7 @@ def _moved(splats: Splats, world: World, reconstruction: Reconstruction) -> Spla
         moved,
         means=(moved.means + moved.origin).astype(np.float32),
         origin=reconstruction.origin.copy(),
-        draw_settings=draw_settings_of(reconstruction.views),
+        draw_settings=draw_settings_of(reconstruction),
     )
 
 

@@ -36,7 +36,7 @@ class SeedSettings:
 
 STAGE = Stage(
     "seed",
-    version=11,
+    version=12,
     reads=("sfm",),
     settings_type=SeedSettings,
     **in_module("stages.seed.stage"),

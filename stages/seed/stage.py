@@ -120,7 +120,7 @@ def _initial(reconstruction: Reconstruction, settings: SeedSettings, report: Rep
         sh=rgb_to_dc(colours)[:, None, :].astype(np.float32),
         sh_degrees=np.zeros(len(points), np.uint8),
         origin=reconstruction.origin.copy(),
-        draw_settings=draw_settings_of(reconstruction.views),
+        draw_settings=draw_settings_of(reconstruction),
     )
 
 

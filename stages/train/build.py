@@ -52,7 +52,7 @@ def make_trainer(
         settings = replace(settings, steps=most_steps)
     antialias = start.draw_settings.antialias if given else settings.antialias
     sh_degree = max(settings.sh_degree if settings.steps else 0, start.sh_degree)
-    draw_settings = draw_settings_of(reconstruction.views, settings.train_side, light, antialias)
+    draw_settings = draw_settings_of(reconstruction, settings.train_side, light, antialias)
     held_out = load_evaluation_views(reconstruction.folder, held, draw_settings)
     _warn_of_small_photographs(reconstruction, settings, report)
     cameras = {view.name: view.levels[-1].camera for view in train}

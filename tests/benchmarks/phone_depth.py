@@ -131,7 +131,7 @@ def psnr_db(pipeline: Pipeline, folder: Path, preset: str, seed: int) -> list[fl
     views = load_evaluation_views(
         folder / "test_views",
         held_out_views_in(inputs["sfm"]),
-        draw_settings_of(inputs["sfm"].views, settings.train_side),
+        draw_settings_of(inputs["sfm"], settings.train_side),
     )
     scores = evaluate(image_renderer(replace(splats, draw_settings=drawn), "auto"), views)
     return [score.psnr_db for score in scores]

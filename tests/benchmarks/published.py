@@ -106,7 +106,7 @@ def measure(folder: Path) -> Measured:
 def _scores(pipeline: Pipeline, splats: Splats) -> list[Score]:
     reconstruction = results.reconstruction_of(pipeline)
     test = split_held_out(reconstruction.views)[1]
-    settings = draw_settings_of(reconstruction.views, SIDE)
+    settings = draw_settings_of(reconstruction, SIDE)
     views = load_evaluation_views(reconstruction.folder, test, settings)
     return evaluate(image_renderer(splats, "cpu"), views)
 

@@ -94,7 +94,7 @@ class Capture:
         """Those with a longer side of at most `side` pixels."""
         choice = TrainSettings().light
         light = corrects_light(self.reconstruction, choice, Report())
-        settings = draw_settings_of(self.reconstruction.views, side, light=light)
+        settings = draw_settings_of(self.reconstruction, side, light=light)
         _, held = split_held_out(self.reconstruction.views)
         found = tuple(load_evaluation_views(self.reconstruction.folder, held, settings))
         if self.name != SAMPLE:

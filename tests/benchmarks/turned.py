@@ -59,7 +59,7 @@ def quality(made: Prepared, world: World, settings: TrainSettings) -> tuple[floa
         tests = in_world(made.tests, world, folder / "tests")
         inputs = {"sfm": given, "seed": seeds_in_world(made.seeds, world, given)}
         trained: Splats = STAGE_OF["train"].run(inputs, settings, folder, Report()).splats
-        drawn = draw_settings_of(given.views, settings.train_side)
+        drawn = draw_settings_of(given, settings.train_side)
         views = load_evaluation_views(tests.folder, tests.views, drawn)
         scores = evaluate(image_renderer(trained, "auto"), views)
     return float(np.mean([s.psnr_db for s in scores])), float(np.mean([s.ssim for s in scores]))

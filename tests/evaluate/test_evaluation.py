@@ -51,13 +51,15 @@ def in_units(scene: SmallScene, factor: float) -> tuple[Splats, Reconstruction]:
         matrix[:3, 3] *= factor
         views.append(View(view.name, view.image, replace(view.camera, world_to_camera=matrix)))
     found = scene.splats
+    points = scene.reconstruction.points * factor
+    enlarged = replace(scene.reconstruction, views=tuple(views), points=points)
     larger = replace(
         found,
         means=found.means * np.float32(factor),
         log_scales=found.log_scales + np.float32(np.log(factor)),
-        draw_settings=draw_settings_of(tuple(views), 72),
+        draw_settings=draw_settings_of(enlarged, 72),
     )
-    return larger, replace(scene.reconstruction, views=tuple(views))
+    return larger, enlarged
 
 
 @pytest.mark.parametrize("factor", [1e-4, 1e4])
@@ -204,7 +206,7 @@ def test_transparent_photographs_are_compared_over_white_and_must_be_empty_outsi
 ) -> None:
     folder = scene.reconstruction.folder
     views = with_masks(scene, folder, TRANSPARENT)
-    draw_settings = draw_settings_of(views)
+    draw_settings = draw_settings_of(replace(scene.reconstruction, views=views))
     (photograph, *_) = load_evaluation_views(folder, views, draw_settings)
     assert draw_settings.background == 1.0
     assert photograph.pixels[:, 36:].min() == 255

@@ -17,6 +17,13 @@ from stages.scene import (
 )
 
 
+def seen_from(views, points):
+    """A reconstruction of these views and points."""
+    n = len(points)
+    colours, tracks = np.zeros((n, 3), np.uint8), np.full(n, 3, np.int32)
+    return Reconstruction(Path(), tuple(views), points, colours, np.zeros(n), tracks)
+
+
 def held_still(apart, points):
     """Five cameras `apart` from each other along x, looking along z at `points`."""
     views = []
@@ -24,9 +31,7 @@ def held_still(apart, points):
         where = np.eye(4)
         where[0, 3] = -apart * (k - 2)
         views.append(View(f"{k}", f"{k}.jpg", Camera(64, 48, 50.0, 50.0, 32.0, 24.0, where)))
-    n = len(points)
-    colours, tracks = np.zeros((n, 3), np.uint8), np.full(n, 3, np.int32)
-    return Reconstruction(Path(), tuple(views), points, colours, np.zeros(n), tracks)
+    return seen_from(views, points)
 
 
 def wall(distance):
@@ -49,6 +54,19 @@ def test_the_extent_turns_with_the_world():
         assert scene_extent(standing_at(centres @ turn.T)) == pytest.approx(wanted, rel=1e-6)
 
 
+def test_the_near_plane_is_a_fifth_of_the_least_depth_that_a_photograph_shows():
+    """By hand: one of 200 points lies misplaced before the cameras, the others at 7."""
+    points = wall(7.0)
+    points[0] *= 0.01
+    assert draw_settings_of(held_still(0.1, points)).near == pytest.approx(7.0 / 5)
+
+
+@pytest.mark.parametrize("points", [np.zeros((0, 3)), -wall(3.0), wall(0.01)])
+def test_without_points_or_beside_them_the_near_plane_is_a_share_of_the_extent(points):
+    made = held_still(0.5, points)
+    assert draw_settings_of(made).near == pytest.approx(0.01 * scene_extent(made.views[1:]))
+
+
 def test_held_out_cameras_do_not_change_the_unit_of_training():
     made = held_still(0.5, wall(3.0))
     near, elsewhere = made.views[0].camera, np.eye(4)
@@ -57,7 +75,7 @@ def test_held_out_cameras_do_not_change_the_unit_of_training():
     known = replace(made, views=tuple(replace(view, role="train") for view in made.views))
     with_test = replace(known, views=(*known.views, far))
     assert training_extent(with_test) == training_extent(known)
-    assert draw_settings_of(with_test.views).near == draw_settings_of(known.views).near
+    assert draw_settings_of(with_test).near == draw_settings_of(known).near
 
 
 def standing_at(centres):
@@ -87,4 +105,7 @@ def test_cameras_at_one_place_have_the_smallest_extent() -> None:
 @pytest.mark.parametrize(("side", "kept"), [(0, 0), (40, 40), (800, 64)])
 def test_pictures_in_training_are_no_larger_than_the_photographs(side, kept):
     """Of 64 by 48 pixels. 0 stands for no training."""
-    assert draw_settings_of(standing_at(np.zeros((2, 3))), side).side == kept
+    assert (
+        draw_settings_of(seen_from(standing_at(np.zeros((2, 3))), np.zeros((0, 3))), side).side
+        == kept
+    )

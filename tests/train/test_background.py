@@ -37,7 +37,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
 def mean_psnr_db(made: Reconstruction, splats: Splats, part: str) -> float:
     """Of the pixels of the test views that show this part, over those that show any."""
     draw, tests = image_renderer(splats, "auto"), table_in_hall.of_test(made)
-    settings = draw_settings_of(table_in_hall.of_walk(made).views, WIDTH)
+    settings = draw_settings_of(table_in_hall.of_walk(made), WIDTH)
     found = []
     for view in load_evaluation_views(made.folder, tests, settings):
         shown = shows(view.camera.world_to_camera, part)

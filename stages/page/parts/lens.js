@@ -1,7 +1,7 @@
 // The exact lens and place of a shot over the viewer's own camera, which knows neither roll nor an
 // off-centre principal point. The place is held until the visitor moves; the lens stays, so that
 // the picture does not jump at the first touch.
-const NEAR = 0.01; // as the rasteriser that the splats were trained with
+const NEAR = 0.01; // nearer than what a photograph shows
 const FAR = 1e5;
 
 function frustumOf(shot, width, height, near) {
