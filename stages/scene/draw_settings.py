@@ -59,7 +59,7 @@ def draw_settings_of(
     light: bool = False,
     antialias: bool = False,
 ) -> DrawSettings:
-    """How splats trained on these views are drawn, by the training views among them.
+    """How splats of this reconstruction are drawn, by its training views.
 
     Args:
         side: that photographs are made smaller to, pixels; 0 for none.
@@ -73,7 +73,7 @@ def draw_settings_of(
 
 
 def near_plane(reconstruction: Reconstruction) -> float:
-    """The near plane of splats trained on these views, world units: in front of all that the
+    """The near plane of splats of this reconstruction, world units: in front of all that its
     training views show, and no nearer than a share of the cameras' extent."""
     least = [float(np.percentile(z, MISPLACED_PERCENT)) for z in depths_seen(reconstruction)]
     extent = scene_extent(split_held_out(reconstruction.views)[0])
