@@ -139,7 +139,7 @@ def read_file(file: Path, strict: bool = True) -> Splats:
     """
     splats = read(file, strict=strict)
     run = run_around(file)
-    if run is None or not views_of(run):
+    if run is None or run.manifest("sfm") is None:
         return splats
     antialias = splats.draw_settings.antialias  # as the file says
     return replace(splats, draw_settings=draw_settings_of(run.load("sfm"), antialias=antialias))
