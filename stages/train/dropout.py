@@ -24,14 +24,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.train.density import estimated_view_counts
+from stages.train.random_bits import hashed
 
 DROPOUT_BELOW = 15  # training views
 VIEW_SCALE = 2.0  # views: the dropout probability is (VIEW_SCALE / n)^2
 MAX_PROBABILITY = 0.3
 NEIGHBOURHOOD = 8  # consecutive splats that share a random number
 INVISIBLE = -20.0  # opacity logit of a dropped splat
-INCREMENT = 0x9E3779B9  # between the hash inputs of consecutive neighbourhoods
-FACTORS = (16, 0x85EBCA6B), (13, 0xC2B2AE35)  # (shift, factor) of the rounds of `noise`
 _UINT32 = 2.0**32
 
 
@@ -60,12 +59,5 @@ class Dropout:
 
 
 def noise(n: int, key: int) -> NDArray[np.uint32]:
-    """[n] uniform over 32 bits, equal for all splats of a neighbourhood: a hash of its number and
-    the key by the finaliser of MurmurHash3 (Appleby, public domain). The values depend neither on
-    the device nor on the order."""
-    h = np.arange(n, dtype=np.uint32) // np.uint32(NEIGHBOURHOOD)
-    h = h * np.uint32(INCREMENT) + np.uint32(key)
-    for shift, factor in FACTORS:
-        h ^= h >> np.uint32(shift)
-        h *= np.uint32(factor)
-    return np.asarray(h ^ (h >> np.uint32(16)))
+    """[n] uniform over 32 bits, equal for all splats of a neighbourhood: `hashed` of its number."""
+    return hashed(np.arange(n, dtype=np.uint32) // np.uint32(NEIGHBOURHOOD), key)

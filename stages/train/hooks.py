@@ -60,6 +60,7 @@ def step_hooks(trainer: Trainer, start: Splats) -> list[StepHook]:
         Averaging(),
         FloaterRemoval(free_space),
         Densification(density),
+        Curvature(),
         Sparsification(start, density),
         FinalColourRefit(),
         Evaluation(views, time_limit),
@@ -135,6 +136,20 @@ class Densification:
         budget = min(schedule.budget(step - 1, cap), cap)
         model = self.density.grow(model, budget, gradient_threshold(schedule.steps))
         trainer.replace_model(model.in_morton_order())
+
+
+@dataclass(frozen=True)
+class Curvature:
+    """When densification has ended, forgets Adam's second moment, whose place the curvature takes:
+    see `gauss_newton`."""
+
+    def after_step(self, trainer: Trainer, step: int) -> None:
+        schedule = trainer.schedule
+        if schedule.densifying(step) or not schedule.densifying(step - 1):
+            return
+        model = trainer.model
+        model.moment2 = np.zeros(model.moment2.shape, np.float32)
+        trainer.replace_model(model)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,5 @@
-"""Adam (Kingma and Ba 2015), sparse: it updates the splats that are visible in a step, or all.
+"""Adam (Kingma and Ba 2015), sparse: it updates the splats that are visible in a step, or all. With
+its first moment alone, the steps of `gauss_newton`.
 
 A splat that is not visible keeps its moments and its own numbers of steps, and its bias correction
 uses those numbers: the first step of a splat that is first visible late is lr, not 3 lr. Each group
@@ -35,8 +36,12 @@ from stages.raster.kernels.simd import (
     vany,
     vfma,
     vge,
+    vgt,
     vload,
+    vmax,
+    vmin,
     vnot,
+    vselect,
     vsqrt,
     vstore,
 )
@@ -45,6 +50,7 @@ from stages.scene import Camera
 from stages.scene.morton import morton_order_of
 from stages.seed.neighbours import nearest_distance
 from stages.train.free_space import FreeSpace
+from stages.train.gauss_newton import CURVATURE_DECAY, DAMPING
 
 BETA1, BETA2 = 0.9, 0.999
 # Gradients are those of H x W x loss (see `loss`), so this is about 1e-9 in the units of the mean
@@ -162,6 +168,46 @@ def _update_moments(gradients, at, columns, moment1, moment2, own, rates, scales
 
 
 @kernel
+def _damped_steps(
+    gradients, at, columns, moment1, curvature, own, rates, units, scales, counts, shift
+):
+    """As `_update_moments`, by the curvature, which does not change: see `gauss_newton`. units: of
+    what a parameter's derivatives are by."""
+    b1, c1 = splat16(_F(BETA1)), splat16(_F(1.0 - BETA1))
+    damping, epsilon, zero = splat16(_F(DAMPING)), splat16(_F(EPSILON)), splat16(_F(0.0))
+    for k in range(0, columns, 16):
+        m = vfma(b1, vload(moment1, own + k), c1 * vload(gradients, at + k))
+        vstore(moment1, own + k, m)
+        scale1, _ = _scales_of(scales, counts, k)
+        h, most = vload(curvature, own + k), vload(rates, k)
+        step = vload(units, k) * m * scale1 / vfma(damping, h, epsilon)
+        step = vmax(vmin(step, most), zero - most)
+        vstore(shift, k, vselect(vgt(h, zero), step, zero))
+
+
+@kernel
+def average_squares(ticket, chunk, visible, derivatives, curvature):
+    """Add the squares of derivatives [M, columns] to the averages of the visible splats in
+    `curvature` [N, columns]; 0 there means that none is known. A splat with a derivative larger
+    than LARGEST_GRADIENT, or not finite, does not change."""
+    columns, row_width = derivatives.shape[1], curvature.shape[1]
+    decay, rest = splat16(_F(CURVATURE_DECAY)), splat16(_F(1.0 - CURVATURE_DECAY))
+    zero = splat16(_F(0.0))
+    while True:
+        start = take_ticket(ticket) * chunk
+        if start >= len(visible):
+            break
+        for rank in range(start, min(start + chunk, len(visible))):
+            at, own = rank * columns, np.int64(visible[rank]) * row_width
+            if _is_invalid(derivatives, at, columns):
+                continue
+            for k in range(0, columns, 16):
+                d, h = vload(derivatives, at + k), vload(curvature, own + k)
+                known = vfma(decay, h, rest * d * d)
+                vstore(curvature, own + k, vselect(vgt(h, zero), known, d * d))
+
+
+@kernel
 def _move(i, shift, means, quaternions, log_scales, opacity_logits, sh, n_sh):
     """Subtract `shift` from the parameters of splat i, and from its first `n_sh` of `sh`."""
     for k in range(3):
@@ -176,7 +222,19 @@ def _move(i, shift, means, quaternions, log_scales, opacity_logits, sh, n_sh):
 
 @kernel
 def adam_step(
-    ticket, chunk, visible, gradients, means2d, model, counts, corrections, rates, ndc_x, ndc_y
+    ticket,
+    chunk,
+    visible,
+    gradients,
+    means2d,
+    model,
+    counts,
+    corrections,
+    rates,
+    ndc_x,
+    ndc_y,
+    extent,
+    gauss_newton,
 ):
     """Update the visible splats; accumulate the norm of the gradient by their 2D positions.
 
@@ -191,6 +249,8 @@ def adam_step(
         rates: [columns of gradients] learning rates; that of a mean is multiplied by its splat's
             `Model.distances`.
         ndc_x, ndc_y: factors from a gradient per pixel to the units of the densification threshold.
+        extent: of the scene, which gradients by means are multiplied by.
+        gauss_newton: whether to move by the curvature in moment2, or else as Adam.
     """
     means, quaternions, log_scales, opacity_logits, sh, sh_degrees = model[:6]
     moment1, moment2, steps, gradient_sum, gradient_count = model[6:11]
@@ -198,7 +258,7 @@ def adam_step(
     n = len(visible)
     columns = gradients.shape[1]
     row_width, n_sh = moment1.shape[1], min(columns - SH, sh.shape[1])
-    shift = np.zeros(columns, np.float32)
+    shift, units = np.zeros(columns, np.float32), np.ones(columns, np.float32)
     scales = np.empty((STEP_COUNTS, 2), np.float32)
     while True:
         start = take_ticket(ticket) * chunk
@@ -210,9 +270,16 @@ def adam_step(
                 continue
             _count(steps, i, counts, corrections, scales)
             at, own = rank * columns, np.int64(i) * row_width
-            _update_moments(
-                gradients, at, columns, moment1, moment2, own, rates, scales, counts, shift
-            )
+            if gauss_newton:
+                units[MEAN:ROTATION] = extent / distances[i]
+                _damped_steps(
+                    gradients,
+                    *(at, columns, moment1, moment2, own, rates, units, scales, counts, shift),
+                )
+            else:
+                _update_moments(
+                    gradients, at, columns, moment1, moment2, own, rates, scales, counts, shift
+                )
             for k in range(MEAN, ROTATION):
                 shift[k] *= distances[i]
             used = 3 * (np.int64(sh_degrees[i]) + 1) ** 2
@@ -233,7 +300,8 @@ class Model:
     """The splats in training and the state of their optimiser.
 
     Parameters as in `Splats`, float32; sh_degrees too: coefficients above a splat's degree are not
-    trained. moment1, moment2: columns as the gradient's, for all coefficients.
+    trained. moment1, moment2: columns as the gradient's, for all coefficients; steps by
+    `gauss_newton` have the curvature in moment2.
     steps [N, STEP_COUNTS] int32: numbers of steps, by groups of columns. gradient_sum,
     gradient_count [N]: since the last densification. smoothing [N]: widths of the 3D smoothing
     filter, 0 for none. distances [N]: to the nearest camera, in extents of the scene; they
@@ -371,17 +439,30 @@ def apply_gradients(
     rates: LearningRates,
     width: int,
     height: int,
+    gauss_newton: bool = False,
 ) -> None:
-    """One step of Adam on `model`, in place; gradients by means become those per extent.
-    coefficients: number of SH coefficients that the gradients hold."""
+    """One step of Adam on `model`, or one by the curvature in its `moment2`, in place; gradients by
+    means become those per extent. coefficients: number of SH coefficients that the gradients
+    hold."""
     pixels = width * height
-    parameters = backward.parameters
-    with np.errstate(over="ignore", invalid="ignore"):  # then the splat's step is skipped
-        parameters[:, MEAN:ROTATION] *= np.float32(rates.extent)
+    _in_extents(backward, rates.extent)
     flat = replace(model, sh=model.sh.reshape(len(model), 3 * model.sh.shape[1]))
     pool.share(
-        *(adam_step, CHUNK, backward.rows, parameters, backward.means2d),
+        *(adam_step, CHUNK, backward.rows, backward.parameters, backward.means2d),
         *(tuple(vars(flat).values()), active_counts(coefficients), _CORRECTIONS),
         rates.row(coefficients),
         *(np.float32(0.5 * width / pixels), np.float32(0.5 * height / pixels)),
+        *(np.float32(rates.extent), gauss_newton),
     )
+
+
+def measure_curvature(pool: Pool, model: Model, backward: Backward, extent: float) -> None:
+    """Add the squares of the derivatives of a picture of signs to `model.moment2`, in place; those
+    by means become those per extent."""
+    _in_extents(backward, extent)
+    pool.share(average_squares, CHUNK, backward.rows, backward.parameters, model.moment2)
+
+
+def _in_extents(backward: Backward, extent: float) -> None:
+    with np.errstate(over="ignore", invalid="ignore"):  # then the splat does not change
+        backward.parameters[:, MEAN:ROTATION] *= np.float32(extent)

@@ -4,7 +4,8 @@ The published schedule has 30,000 steps. Its events are scaled to the number of 
 which may change during the run. Unlike the published one, it never resets opacities, draws at half
 the size in the first fifth and densifies only then, draws at several sizes after densification,
 raises the learning rates of short runs, lets all of them decay, but less far, as the last steps are
-averaged (`average`), and bounds the number of splats by a budget that rises linearly.
+averaged (`average`), replaces Adam after densification (`gauss_newton`), and bounds the number of
+splats by a budget that rises linearly.
 Steps count from 0.
 """
 
@@ -14,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from stages.train.gauss_newton import INTERVAL, GaussNewton
 from stages.train.optimiser import LearningRates
 
 PUBLISHED_STEPS = 30_000
@@ -144,6 +146,14 @@ class Schedule:
         """A random background: splats of one colour show before another."""
         red, green, blue = np.random.default_rng([self.seed, 3, step]).random(3)
         return float(red), float(green), float(blue)
+
+    def gauss_newton(self, step: int) -> GaussNewton | None:
+        """How `step` moves: None while the model is densified."""
+        if self.densifying(step):
+            return None
+        if step % INTERVAL:
+            return GaussNewton()
+        return GaussNewton(int(np.random.default_rng([self.seed, 5, step]).integers(1 << 32)))
 
     def dropout_key(self, step: int) -> int:
         """32 random bits for `dropout.Dropout`."""

@@ -1,7 +1,7 @@
 """A training run: what it is given, its state, and one step.
 
-A step renders one training view, computes the loss and its gradients, and updates the splats with
-Adam. `loop` makes all steps.
+A step renders one training view, computes the loss and its gradients, and updates the splats.
+`loop` makes all steps.
 """
 
 from __future__ import annotations
@@ -165,8 +165,8 @@ class Trainer:
         dropout = None
         if self.task.dropout and not schedule.densifying(step):  # it distorts mean gradients
             dropout = Dropout(len(self.task.views), schedule.dropout_key(step))
-        weight = schedule.weight(step)
-        given = StepInput(level, settings, rates, smooth, dropout, refine, weight)
+        weight, moves = schedule.weight(step), schedule.gauss_newton(step)
+        given = StepInput(level, settings, rates, smooth, dropout, refine, weight, moves)
         return self.stepper.step(given)
 
     def registered_held_out(self) -> list[EvaluationView]:

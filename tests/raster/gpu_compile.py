@@ -39,6 +39,7 @@ WHOLE = (
 REALS = ("red", "green", "blue", "weight", "unit", "ndc_x", "ndc_y")
 SCENE = {"COEFFICIENTS": 16, "SMOOTH": False, "ANTIALIAS": False}
 SIZES = {"TILE": 16, "BLOCK": 128, "REAL": tl.float64}
+_ROWS = {"BLOCK": 16, "COLUMNS": 64, "WIDTH": 64}
 KERNELS: tuple[tuple[Any, dict[str, Any], dict[str, Any]], ...] = (
     (project.project_kernel, {}, {}),
     (project.colour_kernel, {}, {}),
@@ -55,7 +56,8 @@ KERNELS: tuple[tuple[Any, dict[str, Any], dict[str, Any]], ...] = (
     (gpu_kernels.similarity_kernel, {"BLOCK": 256}, {}),
     (gpu_kernels.slope_rows_kernel, {"BLOCK": 256}, {}),
     (gpu_kernels.loss_gradient_kernel, {"BLOCK": 256}, {}),
-    (gpu_kernels.adam_kernel, {"BLOCK": 16, "COLUMNS": 64, "WIDTH": 64}, {}),
+    *((gpu_kernels.adam_kernel, {**_ROWS, "GAUSS_NEWTON": moves}, {}) for moves in (False, True)),
+    (gpu_kernels.average_squares_kernel, _ROWS, {}),
 )
 
 

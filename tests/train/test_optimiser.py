@@ -19,7 +19,7 @@ from stages.train.optimiser import (
     camera_distances,
     new_model,
 )
-from stages.train.steps.reference import adam
+from stages.train.steps.reference import update
 from tests.scenes import camera
 
 RATES = LearningRates(means=0.01)
@@ -131,7 +131,7 @@ def test_a_step_does_not_depend_on_the_unit_of_length(unit, scale):
         step(m, b, 4, RATES.scaled(0.01 * unit, 1.0, unit), 100, 50)
         return m.means / unit
 
-    for step in (partial(apply_gradients, Pool(1)), adam):
+    for step in (partial(apply_gradients, Pool(1)), update):
         wanted = moved(1.0, step)
         assert wanted.any()
         np.testing.assert_allclose(moved(unit, step), wanted, rtol=1e-4)

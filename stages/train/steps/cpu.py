@@ -1,4 +1,5 @@
-"""A training step with the CPU kernels: forward pass, loss, backward pass and Adam."""
+"""A training step with the CPU kernels: forward pass, loss, backward pass and the
+optimiser's step."""
 
 from __future__ import annotations
 
@@ -6,7 +7,7 @@ import numpy as np
 
 from stages.raster.cpu.rasteriser import CpuRasteriser
 from stages.train.loss import image_loss
-from stages.train.optimiser import apply_gradients
+from stages.train.optimiser import apply_gradients, measure_curvature
 from stages.train.steps.step import HostStep, StepInput
 from stages.train.views import ignore_masked, target_of
 
@@ -31,12 +32,14 @@ class CpuStep(HostStep):
         if given.weight != 1.0:
             self._v_image *= np.float32(given.weight)
         ignore_masked(level, self._v_image)
+        if (signs := self.sign_picture(given)) is not None:
+            derivatives = self.rasteriser.backward(forward, signs)
+            measure_curvature(pool, self._model, derivatives, given.rates.extent)
         backward = self.rasteriser.backward(forward, self._v_image)
         if given.use_gradients is not None:
             given.use_gradients(self._model, backward)
-        coefficients, size = (
-            (settings.sh_degree + 1) ** 2,
-            (level.camera.width, level.camera.height),
+        apply_gradients(
+            *(pool, self._model, backward, (settings.sh_degree + 1) ** 2, given.rates),
+            *(level.camera.width, level.camera.height, given.gauss_newton is not None),
         )
-        apply_gradients(pool, self._model, backward, coefficients, given.rates, *size)
         return loss.value

@@ -22,8 +22,6 @@ from stages.raster.gpu.device import gpu_errors_explained, interpreted
 from stages.raster.gpu.rasteriser import DeviceScene, DeviceView, Drawn, GpuRasteriser
 from stages.scene import IGNORE, Camera
 from stages.train.dropout import (
-    FACTORS,
-    INCREMENT,
     INVISIBLE,
     MAX_PROBABILITY,
     NEIGHBOURHOOD,
@@ -32,12 +30,12 @@ from stages.train.dropout import (
 )
 from stages.train.loss import SSIM_WEIGHT
 from stages.train.optimiser import (
-    LearningRates,
     Model,
     active_counts,
     bias_corrections,
     empty_model,
 )
+from stages.train.random_bits import FACTORS, INCREMENT
 from stages.train.steps import gpu_kernels
 from stages.train.steps.device_model import DeviceModel, TensorsHeld, held_of
 from stages.train.steps.step import StepInput
@@ -225,13 +223,19 @@ class GpuStep:
         if given.weight != 1.0:
             v_image *= given.weight
         view_target.ignore_masked(v_image)
+        if given.gauss_newton is not None and given.gauss_newton.key is not None:
+            signs = sign_picture(v_image, given.gauss_newton.key, given.weight)
+            view_target.ignore_masked(signs)
+            derivatives, _ = self.rasteriser.gradients(scene, view, drawn, signs)
+            self._measure(drawn, view, derivatives, given.rates.extent, room)
+            del signs, derivatives
         parameters, means2d = self.rasteriser.gradients(scene, view, drawn, v_image)
         if self._own is not None:
             parameters *= self._own
         results = torch.stack([loss.double(), drawn.lists.total[0].double()])
         self.skipped += drawn.lists.total > room
         # last, because what needs memory may be repeated
-        self._adam(drawn, view, parameters, means2d, given.rates, room)
+        self._adam(drawn, view, parameters, means2d, given, room)
         self._on_host = None
         self._arrivals.send(results)
         return self._arrivals.read()
@@ -266,9 +270,10 @@ class GpuStep:
         view: DeviceView,
         parameters: Tensor,
         means2d: Tensor,
-        rates: LearningRates,
+        given: StepInput,
         room: int,
     ) -> None:
+        rates = given.rates
         scene, held = self._held.scene, self._held.others
         (n, columns), coefficients = scene.rows.shape, view.coefficients(scene)
         if n == 0:
@@ -283,7 +288,25 @@ class GpuStep:
             *(drawn.lists.total, room, n, gradient_columns(coefficients)),
             *(active_counts(coefficients), rates.means, rates.quaternions, rates.log_scales),
             *(rates.opacity_logits, rates.sh_dc, rates.sh_rest),
-            *(0.5 * view.width / pixels, 0.5 * view.height / pixels),
+            *(0.5 * view.width / pixels, 0.5 * view.height / pixels, rates.extent),
+            COLUMNS=columns,
+            WIDTH=triton.next_power_of_2(columns),
+            BLOCK=block,
+            GAUSS_NEWTON=given.gauss_newton is not None,
+        )
+
+    def _measure(
+        self, drawn: Drawn, view: DeviceView, derivatives: Tensor, extent: float, room: int
+    ) -> None:
+        """Average the squares of the derivatives into moment2."""
+        (n, columns), coefficients = derivatives.shape, view.coefficients(self._held.scene)
+        if n == 0:
+            return
+        derivatives[:, :ROTATION] *= extent
+        block = 4096 if interpreted() else 16
+        gpu_kernels.average_squares_kernel[(triton.cdiv(n, block),)](
+            *(self._held.others["moment2"], derivatives, drawn.keys, drawn.lists.total, room, n),
+            gradient_columns(coefficients),
             COLUMNS=columns,
             WIDTH=triton.next_power_of_2(columns),
             BLOCK=block,
@@ -343,7 +366,20 @@ def dropped(dropout: Dropout, counts: Tensor) -> Tensor:
 
 
 def _noise(n: int, key: int, device: torch.device) -> Tensor:
-    h = (torch.arange(n, device=device) // NEIGHBOURHOOD * INCREMENT + key) & _LOW
+    return _hashed(torch.arange(n, device=device) // NEIGHBOURHOOD, key)
+
+
+def _hashed(numbers: Tensor, key: int) -> Tensor:
+    """See `random_bits.hashed`."""
+    h = (numbers * INCREMENT + key) & _LOW
     for shift, factor in FACTORS:
         h = ((h ^ (h >> shift)) * factor) & _LOW
     return h ^ (h >> 16)
+
+
+def sign_picture(like: Tensor, key: int, weight: float) -> Tensor:
+    """[3, H, W], as `like` is: see `gauss_newton.sign_picture`."""
+    words = _hashed(torch.arange(-(-like.numel() // 32), device=like.device), key)
+    bits = (words[:, None] >> torch.arange(32, device=like.device)) & 1
+    of_one = bits.reshape(-1)[: like.numel()].reshape(like.shape)
+    return torch.where(of_one > 0, weight**0.5, -(weight**0.5)).to(like.dtype)

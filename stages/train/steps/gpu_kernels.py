@@ -1,4 +1,4 @@
-"""The loss and Adam on the GPU. Definitions as in `loss_kernels` and `optimiser`.
+"""The loss and the optimiser on the GPU. Definitions as in `loss_kernels` and `optimiser`.
 
 L1 + SSIM takes four passes over the image: along rows and across them for the statistics of both
 images, and again for the derivatives that the gradient sums. A pass reads 11 neighbours from the
@@ -13,7 +13,7 @@ import triton.language as tl
 from stages.raster import definition
 from stages.raster.definition import used_columns
 from stages.raster.gpu.inner import inner, sum_of
-from stages.train import optimiser
+from stages.train import gauss_newton, optimiser
 from stages.train.steps import loss_kernels
 
 RADIUS = tl.constexpr(loss_kernels.RADIUS)
@@ -22,6 +22,9 @@ C1, C2 = tl.constexpr(float(loss_kernels.C1)), tl.constexpr(float(loss_kernels.C
 BETA1, BETA2 = tl.constexpr(optimiser.BETA1), tl.constexpr(optimiser.BETA2)
 REST1, REST2 = tl.constexpr(1.0 - optimiser.BETA1), tl.constexpr(1.0 - optimiser.BETA2)
 EPSILON = tl.constexpr(optimiser.EPSILON)
+DAMPING = tl.constexpr(gauss_newton.DAMPING)
+CURVATURE_DECAY = tl.constexpr(gauss_newton.CURVATURE_DECAY)
+REST_CURVATURE = tl.constexpr(1.0 - gauss_newton.CURVATURE_DECAY)
 LARGEST = tl.constexpr(optimiser.LARGEST_GRADIENT)
 COUNTS = tl.constexpr(optimiser.STEP_COUNTS)
 LAST_CORRECTION = tl.constexpr(len(optimiser.bias_corrections()) - 1)
@@ -179,16 +182,82 @@ def adam_kernel(
     rate_rest,
     ndc_x,
     ndc_y,
+    extent,
+    COLUMNS: tl.constexpr,
+    WIDTH: tl.constexpr,
+    BLOCK: tl.constexpr,
+    GAUSS_NEWTON: tl.constexpr,
+):
+    """Move the visible splats: see `optimiser.adam_step`. rows, moments and gradients [n, COLUMNS],
+    of which `used` columns and the first `active` counts take part. WIDTH: a power of two that
+    holds a row. GAUSS_NEWTON: whether to move by the curvature in moment2.
+
+    Nothing moves where the lists held more entries (total) than there was room for.
+    """
+    i, k, at, moved, there, g = usable(gradients, keys, total, room, n, used, COLUMNS, WIDTH, BLOCK)
+    group = group_of(k)
+    # every lane reads the counts before any writes one
+    t = tl.load(steps + i[:, None] * COUNTS + group[None, :], mask=there, other=0) + 1
+    tl.debug_barrier()
+    first = there & (leads(k) & (group < active))[None, :]
+    tl.store(steps + i[:, None] * COUNTS + group[None, :], t, mask=first)
+    t = tl.minimum(tl.maximum(t, 1), LAST_CORRECTION)
+    m = BETA1 * tl.load(moment1 + at, mask=there, other=0.0) + REST1 * g
+    tl.store(moment1 + at, m, mask=there)
+    m = m * tl.load(corrections + 2 * t, mask=there, other=0.0)
+    v = tl.load(moment2 + at, mask=there, other=0.0)
+    rate = rate_of(k, rate_means, rate_rotation, rate_scale, rate_opacity, rate_dc, rate_rest)
+    distance = tl.load(distances + i, mask=moved, other=1.0)
+    rate = tl.where((k < ROTATION)[None, :], rate[None, :] * distance[:, None], rate[None, :])
+    if GAUSS_NEWTON:
+        step = tl.where(k < ROTATION, extent, 1.0)[None, :] * m / (DAMPING * v + EPSILON)
+        step = tl.where(v > 0.0, tl.minimum(tl.maximum(step, -rate), rate), 0.0)
+    else:
+        v = BETA2 * v + REST2 * g * g
+        tl.store(moment2 + at, v, mask=there)
+        v = v * tl.load(corrections + 2 * t + 1, mask=there, other=0.0)
+        step = rate * m / (tl.sqrt(v) + EPSILON)
+    value = tl.load(rows + at, mask=there, other=0.0)
+    tl.store(rows + at, value - step, mask=there)
+    accumulate(means2d, gradient_sum, gradient_count, i, moved, ndc_x, ndc_y)
+
+
+@triton.jit(do_not_specialize=["room", "n", "used"], do_not_specialize_on_alignment=["total"])
+def average_squares_kernel(
+    curvature,
+    derivatives,
+    keys,
+    total,
+    room,
+    n,
+    used,
     COLUMNS: tl.constexpr,
     WIDTH: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Move the visible splats: see `optimiser.adam_step`. rows, moments and gradients [n, COLUMNS],
-    of which `used` columns and the first `active` counts take part. WIDTH: a power of two that
-    holds a row.
+    """Add the squares of derivatives to the averages of the visible splats: see
+    `optimiser.average_squares`; arguments as for `adam_kernel`."""
+    _, _, at, _, there, d = usable(derivatives, keys, total, room, n, used, COLUMNS, WIDTH, BLOCK)
+    h = tl.load(curvature + at, mask=there, other=0.0)
+    h = tl.where(h > 0.0, CURVATURE_DECAY * h + REST_CURVATURE * d * d, d * d)
+    tl.store(curvature + at, h, mask=there)
 
-    Nothing moves where the lists held more entries (total) than there was room for.
-    """
+
+@inner
+def usable(
+    gradients,
+    keys,
+    total,
+    room,
+    n,
+    used,
+    COLUMNS: tl.constexpr,
+    WIDTH: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """(rows [BLOCK], columns [WIDTH], offsets [BLOCK, WIDTH], whether a row is visible and its
+    gradients are neither larger than LARGEST nor broken, the same for its used columns, the
+    gradients) of this program."""
     i = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     k = tl.arange(0, WIDTH)
     moved = (i < n) & (tl.load(total) <= room)
@@ -198,26 +267,7 @@ def adam_kernel(
     g = tl.load(gradients + at, mask=there, other=0.0)
     wrong = tl.where(tl.abs(g) <= LARGEST, 0, 1)
     moved = moved & (sum_of(wrong, 1) == 0)
-    there = there & moved[:, None]
-    group = group_of(k)
-    # every lane reads the counts before any writes one
-    t = tl.load(steps + i[:, None] * COUNTS + group[None, :], mask=there, other=0) + 1
-    tl.debug_barrier()
-    first = there & (leads(k) & (group < active))[None, :]
-    tl.store(steps + i[:, None] * COUNTS + group[None, :], t, mask=first)
-    t = tl.minimum(tl.maximum(t, 1), LAST_CORRECTION)
-    m = BETA1 * tl.load(moment1 + at, mask=there, other=0.0) + REST1 * g
-    v = BETA2 * tl.load(moment2 + at, mask=there, other=0.0) + REST2 * g * g
-    tl.store(moment1 + at, m, mask=there)
-    tl.store(moment2 + at, v, mask=there)
-    m = m * tl.load(corrections + 2 * t, mask=there, other=0.0)
-    v = v * tl.load(corrections + 2 * t + 1, mask=there, other=0.0)
-    rate = rate_of(k, rate_means, rate_rotation, rate_scale, rate_opacity, rate_dc, rate_rest)
-    distance = tl.load(distances + i, mask=moved, other=1.0)
-    rate = tl.where((k < ROTATION)[None, :], rate[None, :] * distance[:, None], rate[None, :])
-    value = tl.load(rows + at, mask=there, other=0.0)
-    tl.store(rows + at, value - rate * m / (tl.sqrt(v) + EPSILON), mask=there)
-    accumulate(means2d, gradient_sum, gradient_count, i, moved, ndc_x, ndc_y)
+    return i, k, at, moved, there & moved[:, None], g
 
 
 @inner

@@ -1,4 +1,4 @@
-"""A training step for any rasteriser: loss and Adam in float64, written from their definitions.
+"""A training step for any rasteriser: loss and optimiser in float64, written from definitions.
 
 It is slow; the steps with kernels are tested against it.
 """
@@ -6,10 +6,12 @@ It is slow; the steps with kernels are tested against it.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as functional
+from numpy.typing import NDArray
 from torch import Tensor
 
 from stages.raster.definition import (
@@ -24,6 +26,7 @@ from stages.raster.definition import (
 from stages.raster.sh import own_coefficients
 from stages.scene import TRANSPARENT
 from stages.scene.light import BRIGHT, OFFSET, POWER
+from stages.train.gauss_newton import CURVATURE_DECAY, DAMPING
 from stages.train.loss import SSIM_WEIGHT
 from stages.train.optimiser import (
     BETA1,
@@ -53,10 +56,16 @@ class ReferenceStep(HostStep):
         torch.autograd.backward(given.weight * math.prod(size) * value)
         assert image.grad is not None
         v_image = image.grad.numpy().astype(np.float32)
+        if (signs := self.sign_picture(given)) is not None:
+            derivatives = self.rasteriser.backward(forward, signs)
+            measure_curvature(self._model, derivatives, given.rates.extent)
         backward = self.rasteriser.backward(forward, v_image)
         if given.use_gradients is not None:
             given.use_gradients(self._model, backward)
-        adam(self._model, backward, (settings.sh_degree + 1) ** 2, given.rates, *size)
+        update(
+            *(self._model, backward, (settings.sh_degree + 1) ** 2, given.rates),
+            *(size[0], size[1], given.gauss_newton is not None),
+        )
         return float(value.detach())
 
 
@@ -103,27 +112,35 @@ def _ssim(x: Tensor, y: Tensor, mean: Tensor) -> Tensor:
     return score.mean()
 
 
-def adam(
+def update(
     model: Model,
     backward: Backward,
     coefficients: int,
     rates: LearningRates,
     width: int,
     height: int,
+    gauss_newton: bool = False,
 ) -> None:
-    """One sparse step of Adam, as `optimiser.apply_gradients` does it."""
-    parameters = backward.parameters.astype(np.float64)
-    parameters[:, MEAN:ROTATION] *= rates.extent
-    whole = (np.abs(parameters) <= LARGEST_GRADIENT).all(1)
-    rows, g = backward.rows[whole], parameters[whole]
+    """One sparse step of Adam or of `gauss_newton`, as `optimiser.apply_gradients` does it."""
+    rows, g, whole = _valid(backward, rates.extent)
     columns = g.shape[1]
     model.steps[rows, : active_counts(coefficients)] += 1
     t = np.maximum(model.steps[rows], 1).astype(np.float64)[:, COLUMN_COUNTS[:columns]]
     m = BETA1 * model.moment1[rows, :columns] + (1 - BETA1) * g
-    v = BETA2 * model.moment2[rows, :columns] + (1 - BETA2) * g * g
-    model.moment1[rows, :columns], model.moment2[rows, :columns] = m, v
-    shift = rates.row(coefficients) * (m / (1 - BETA1**t)) / (np.sqrt(v / (1 - BETA2**t)) + EPSILON)
-    model.means[rows] -= shift[:, MEAN:ROTATION] * model.distances[rows, None]
+    model.moment1[rows, :columns] = m
+    m = m / (1 - BETA1**t)
+    rate = np.broadcast_to(rates.row(coefficients), m.shape).astype(np.float64)
+    rate[:, MEAN:ROTATION] *= model.distances[rows, None]
+    if gauss_newton:
+        h = model.moment2[rows, :columns].astype(np.float64)
+        shift = m / (DAMPING * h + EPSILON)
+        shift[:, MEAN:ROTATION] *= rates.extent
+        shift = np.where(h > 0, np.clip(shift, -rate, rate), 0.0)
+    else:
+        v = BETA2 * model.moment2[rows, :columns] + (1 - BETA2) * g * g
+        model.moment2[rows, :columns] = v
+        shift = rate * m / (np.sqrt(v / (1 - BETA2**t)) + EPSILON)
+    model.means[rows] -= shift[:, MEAN:ROTATION]
     model.quaternions[rows] -= shift[:, ROTATION:LOG_SCALE]
     model.log_scales[rows] -= shift[:, LOG_SCALE:OPACITY]
     model.opacity_logits[rows] -= shift[:, OPACITY]
@@ -133,3 +150,22 @@ def adam(
     gradient = backward.means2d[whole].astype(np.float64) * (0.5 * width, 0.5 * height)
     model.gradient_sum[rows] += np.hypot(*gradient.T) / (width * height)
     model.gradient_count[rows] += 1
+
+
+def measure_curvature(model: Model, derivatives: Backward, extent: float) -> None:
+    """As `optimiser.measure_curvature` does it."""
+    rows, d, _ = _valid(derivatives, extent)
+    h = model.moment2[rows, : d.shape[1]].astype(np.float64)
+    average = CURVATURE_DECAY * h + (1 - CURVATURE_DECAY) * d * d
+    model.moment2[rows, : d.shape[1]] = np.where(h > 0, average, d * d)
+
+
+def _valid(
+    backward: Backward, extent: float
+) -> tuple[NDArray[Any], NDArray[np.float64], NDArray[np.bool_]]:
+    """(rows of the splats whose gradients can be used, these gradients, by means those per extent;
+    which rows of `backward` they are)."""
+    parameters = backward.parameters.astype(np.float64)
+    parameters[:, MEAN:ROTATION] *= extent
+    whole = np.asarray((np.abs(parameters) <= LARGEST_GRADIENT).all(1))
+    return backward.rows[whole], parameters[whole], whole

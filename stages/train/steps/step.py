@@ -14,8 +14,9 @@ from stages.raster.backends import backend_of
 from stages.raster.definition import Arrays, Backward, Rasteriser, RasterSettings
 from stages.scene import Camera
 from stages.train.dropout import INVISIBLE, Dropout
+from stages.train.gauss_newton import GaussNewton, sign_picture
 from stages.train.optimiser import LearningRates, Model, empty_model
-from stages.train.views import Level
+from stages.train.views import Level, ignore_masked
 
 # A backend with training kernels of its own keeps parameters and moments where these are.
 _OWN_STEPS = {
@@ -39,6 +40,7 @@ class StepInput:
         use_gradients: is called with the model and its gradients before Adam changes the model;
             only steps on the host do this.
         weight: factor of all gradients, not of the loss that a step returns.
+        gauss_newton: to move by the curvature; None to move as Adam.
     """
 
     level: Level
@@ -48,6 +50,7 @@ class StepInput:
     dropout: Dropout | None = None
     use_gradients: Callable[[Model, Backward], None] | None = None
     weight: float = 1.0
+    gauss_newton: GaussNewton | None = None
 
 
 class TrainingStep(Protocol):
@@ -69,7 +72,7 @@ class TrainingStep(Protocol):
         """The current model, on the host; good until the next step."""
 
     def step(self, given: StepInput) -> float:
-        """Forward pass, loss, backward pass and one step of Adam.
+        """Forward pass, loss, backward pass and one step of Adam or of `gauss_newton`.
 
         Returns the loss before the step; a device may return that of a few steps earlier.
         """
@@ -117,3 +120,13 @@ class HostStep:
         dropped = given.dropout.dropped(self._model.gradient_count)
         logits = np.where(dropped, np.float32(INVISIBLE), self._model.opacity_logits)
         return (*arrays[:3], logits, *arrays[4:])
+
+    @staticmethod
+    def sign_picture(given: StepInput) -> NDArray[np.float32] | None:
+        """[3, H, W] what a backward pass measures the curvature with; None if it is not measured in
+        this step."""
+        if given.gauss_newton is None or given.gauss_newton.key is None:
+            return None
+        picture = sign_picture(given.level.pixels.shape, given.gauss_newton.key, given.weight)
+        ignore_masked(given.level, picture)
+        return picture

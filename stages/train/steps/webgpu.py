@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from stages.raster.definition import MemoryFull, RasterSettings, gradient_columns
 from stages.raster.webgpu.device import Buffers, Kernel, errors_explained
 from stages.raster.webgpu.rasteriser import DeviceScene, DeviceView, Drawn, WebGpuRasteriser
-from stages.scene import Camera
+from stages.scene import IGNORE, Camera
 from stages.train.dropout import Dropout
-from stages.train.optimiser import LearningRates, Model, active_counts, empty_model
+from stages.train.optimiser import Model, active_counts, empty_model
 from stages.train.steps.device_model import DeviceModel
 from stages.train.steps.step import StepInput
 from stages.train.steps.webgpu_loss import Loss, loss_of, photograph_of
@@ -30,8 +30,9 @@ from stages.train.views import Level
 
 LAG = 8  # steps after which the host reads the results of a step
 SPARE = 1.5  # room for the lists, relative to the largest number so far
-_ADAM, _MOST, _DROP = (
-    Kernel(FILE, entry, CONSTANTS) for entry in ("adam", "largest_count", "drop_out")
+_ADAM, _SQUARES, _SIGNS, _MOST, _DROP = (
+    Kernel(FILE, entry, CONSTANTS)
+    for entry in ("adam", "average_squares", "sign_picture", "largest_count", "drop_out")
 )
 
 
@@ -102,8 +103,12 @@ class WebGpuStep:
         v_image = self._loss.gradient(
             drawn.image, photograph, level, settings.background, given.weight
         )
+        if given.gauss_newton is not None and given.gauss_newton.key is not None:
+            signs = self._signs(photograph, level, given.gauss_newton.key, given.weight)
+            derivatives, _ = self.rasteriser.gradients(scene, view, drawn, signs)
+            self._measure(drawn, view, given.rates.extent, derivatives)
         gradients, means2d = self.rasteriser.gradients(scene, view, drawn, v_image)
-        self._adam(drawn, view, given.rates, gradients, means2d)
+        self._adam(drawn, view, given, gradients, means2d)
         self._held.moved()
         self._on_host = None
         gpu.copy(drawn.lists.ends, self._loss.sums, 1, (len(scene), 5))
@@ -152,19 +157,40 @@ class WebGpuStep:
         return replace(scene, rows=rows)
 
     def _adam(
-        self, drawn: Drawn, view: DeviceView, rates: LearningRates, gradients: Any, means2d: Any
+        self, drawn: Drawn, view: DeviceView, given: StepInput, gradients: Any, means2d: Any
     ) -> None:
-        scene, n, coefficients = (
-            self._held.scene,
-            len(self._held),
-            view.coefficients(self._held.scene),
-        )
+        scene, rates, n = self._held.scene, given.rates, len(self._held)
         numbers = (
-            *(n, scene.columns, gradient_columns(coefficients), active_counts(coefficients)),
-            *(drawn.lists.capacity, float(rates.extent)),
+            *self._sizes(drawn, view, rates.extent),
             *(0.5 * view.width / view.pixels, 0.5 * view.height / view.pixels),
             *map(float, (rates.means, rates.quaternions, rates.log_scales, rates.opacity_logits)),
             *map(float, (rates.sh_dc, rates.sh_rest)),
+            int(given.gauss_newton is not None),
         )
         buffers = (gradients, means2d, drawn.keys, drawn.lists.ends, scene.rows)
         self.gpu.run(_ADAM, -(-n // 16), (*buffers, *self._held.moments, self._held.state), numbers)
+
+    def _signs(self, photograph: Any, level: Level, key: int, weight: float) -> Any:
+        """[3, H, W] in a buffer, until the next one: see `gauss_newton.sign_picture`."""
+        _, height, width = level.pixels.shape
+        signs = self._buffers.get("signs", 3 * width * height)
+        given = (width * height, int(level.outside == IGNORE), key, weight**0.5)
+        self.gpu.run(_SIGNS, -(-3 * width * height // 256), (photograph, signs), given)
+        return signs
+
+    def _measure(self, drawn: Drawn, view: DeviceView, extent: float, derivatives: Any) -> None:
+        """Average the squares of the derivatives into moment2."""
+        buffers = (derivatives, None, drawn.keys, drawn.lists.ends, None, None)
+        curvature, n = self._held.moments[1], len(self._held)
+        numbers = (*self._sizes(drawn, view, extent), *[0.0] * 8, 1)
+        self.gpu.run(_SQUARES, -(-n // 16), (*buffers, curvature), numbers)
+
+    def _sizes(
+        self, drawn: Drawn, view: DeviceView, extent: float
+    ) -> tuple[int, int, int, int, int, float]:
+        """What `Step` in adam.wgsl begins with."""
+        scene, coefficients = self._held.scene, view.coefficients(self._held.scene)
+        return (
+            *(len(scene), scene.columns, gradient_columns(coefficients)),
+            *(active_counts(coefficients), drawn.lists.capacity, float(extent)),
+        )

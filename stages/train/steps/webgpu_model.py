@@ -14,8 +14,9 @@ from torch import Tensor
 from stages.raster.definition import LOG_SCALE, MEAN, OPACITY, ROTATION, SH, SH_REST, used_columns
 from stages.raster.webgpu.device import Device, Kernel, errors_explained
 from stages.raster.webgpu.rasteriser import DeviceScene, WebGpuRasteriser
-from stages.train import dropout, optimiser
+from stages.train import dropout, gauss_newton, optimiser
 from stages.train.optimiser import STEP_COUNTS, Model
+from stages.train.random_bits import FACTORS, INCREMENT
 from stages.train.steps.device_model import DeviceModel
 
 NEW = 1 << 31
@@ -45,9 +46,10 @@ CONSTANTS: tuple[tuple[str, float], ...] = (
     *(("LARGEST_GRADIENT", optimiser.LARGEST_GRADIENT), ("SH_REST", SH_REST)),
     *(("DEGREE_2", used_columns(4)), ("DEGREE_3", used_columns(9))),
     *((name, getattr(dropout, name)) for name in ("VIEW_SCALE", "MAX_PROBABILITY")),
-    *((name, getattr(dropout, name)) for name in ("NEIGHBOURHOOD", "INCREMENT", "INVISIBLE")),
-    *(("SHIFT_1", dropout.FACTORS[0][0]), ("FACTOR_1", dropout.FACTORS[0][1])),
-    *(("SHIFT_2", dropout.FACTORS[1][0]), ("FACTOR_2", dropout.FACTORS[1][1])),
+    *((name, getattr(dropout, name)) for name in ("NEIGHBOURHOOD", "INVISIBLE")),
+    *((name, getattr(gauss_newton, name)) for name in ("DAMPING", "CURVATURE_DECAY")),
+    *(("INCREMENT", INCREMENT), ("SHIFT_1", FACTORS[0][0]), ("FACTOR_1", FACTORS[0][1])),
+    *(("SHIFT_2", FACTORS[1][0]), ("FACTOR_2", FACTORS[1][1])),
 )
 _COPY = Kernel(FILE, "copy_rows", CONSTANTS)
 

@@ -18,6 +18,7 @@ from stages.raster.gpu.rasteriser import GpuRasteriser
 from stages.raster.reference_rasteriser import ReferenceRasteriser
 from stages.scene import IGNORE, TRANSPARENT
 from stages.train.dropout import Dropout
+from stages.train.gauss_newton import GaussNewton
 from stages.train.optimiser import LearningRates, empty_model
 from stages.train.steps import gpu as gpu_step
 from stages.train.steps.gpu import GpuStep, image_loss
@@ -41,13 +42,14 @@ def stepper(lag: int | None = None) -> GpuStep:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("degree", [0, 1])
-def test_two_steps_leave_what_the_definition_leaves(degree):
+def test_steps_leave_what_the_definition_leaves(degree):
     settings = RasterSettings(near=0.1, sh_degree=degree)
     plain = ReferenceStep(ReferenceRasteriser())
     plain.load(start())
     found = stepper()
-    for _ in range(2):
-        losses = [s.step(StepInput(level(), settings, RATES)) for s in (found, plain)]
+    for moves in (None, None, GaussNewton(1), GaussNewton(2), GaussNewton()):
+        given = StepInput(level(), settings, RATES, gauss_newton=moves)
+        losses = [s.step(given) for s in (found, plain)]
         assert losses[0] == pytest.approx(losses[1], rel=1e-5)
     for name, wanted in vars(plain.model()).items():
         here = getattr(found.model(), name)
@@ -65,11 +67,13 @@ def test_masks_and_light_ask_what_the_definition_asks(outside, light):
     plain, found = ReferenceStep(ReferenceRasteriser()), stepper()
     plain.load(start())
     photograph = masked(outside, light)
-    given = StepInput(photograph, settings, RATES, weight=4.0)
+    given = StepInput(photograph, settings, RATES, weight=4.0, gauss_newton=GaussNewton(5))
     losses = [s.step(given) for s in (found, plain)]
     assert losses[0] == pytest.approx(losses[1], rel=1e-5)
-    wanted = plain.model().moment1
-    np.testing.assert_allclose(found.model().moment1, wanted, atol=2e-5 * np.abs(wanted).max())
+    for name in ("moment1", "moment2"):
+        here, wanted = (getattr(s.model(), name) for s in (found, plain))
+        assert wanted.any()
+        np.testing.assert_allclose(here, wanted, atol=2e-5 * np.abs(wanted).max())
 
 
 @pytest.mark.parametrize("size", [(1, 1), (17, 3), (47, 33)])
@@ -98,8 +102,9 @@ def test_the_loss_and_its_gradient_are_those_of_the_definition(size):
 )
 def test_a_steady_step_never_waits_for_the_device(seen, dropout, monkeypatch):
     made = stepper(lag=2)
+    given = StepInput(seen, SETTINGS, RATES, False, dropout, gauss_newton=GaussNewton(3))
     for _ in range(4):
-        made.step(StepInput(seen, SETTINGS, RATES, False, dropout))
+        made.step(given)
     waits: Counter[str] = Counter()
 
     def counting(name, kept):
@@ -114,7 +119,7 @@ def test_a_steady_step_never_waits_for_the_device(seen, dropout, monkeypatch):
     if made.device.type == "cuda":
         torch.cuda.set_sync_debug_mode("error")
     try:
-        made.step(StepInput(seen, SETTINGS, RATES, False, dropout))
+        made.step(given)
     finally:
         if made.device.type == "cuda":
             torch.cuda.set_sync_debug_mode("default")

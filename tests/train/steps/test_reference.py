@@ -11,9 +11,10 @@ from stages.raster.definition import RasterSettings, splat_arrays
 from stages.raster.draw import render
 from stages.scene import IGNORE, TRANSPARENT, Splats
 from stages.scene.light import Light
+from stages.train.gauss_newton import GaussNewton
 from stages.train.loss import channel_means
 from stages.train.optimiser import LearningRates, Model, new_model
-from stages.train.steps.step import StepInput, step_of
+from stages.train.steps.step import HostStep, StepInput, step_of
 from stages.train.views import Level
 from tests.scenes import camera, cloud
 
@@ -45,6 +46,7 @@ def stepped(
     outside: str = "",
     light: Light | None = None,
     weight: float = 1.0,
+    keys: tuple[int | None, ...] = (),
 ) -> tuple[Model, list[float]]:
     level = level_of(cloud(80, 40, 30, degree=1))
     if outside:
@@ -58,7 +60,33 @@ def stepped(
     settings = RasterSettings(near=0.1, sh_degree=degree, background=(0.9, 0.2, 0.6))
     given = StepInput(level, settings, RATES, weight=weight)
     losses = [stepper.step(given) for _ in range(steps)]
+    if keys:
+        model.moment2[:] = 0.0
+    for key in keys:
+        losses.append(stepper.step(replace(given, gauss_newton=GaussNewton(key))))
     return stepper.model(), losses
+
+
+@pytest.mark.parametrize("outside", ["", IGNORE, TRANSPARENT])
+def test_gauss_newton_steps_are_those_of_the_definition(outside: str) -> None:
+    keys = (1, 2, None, 3, None)
+    kernels, losses = stepped("cpu", 1, 1, outside, weight=4.0, keys=keys)
+    plain, wanted = stepped("reference", 1, 1, outside, weight=4.0, keys=keys)
+    np.testing.assert_allclose(losses, wanted, rtol=1e-4)
+    assert losses[-1] < losses[0]
+    for name in ("moment1", "moment2", "means", "log_scales", "sh"):
+        found, known = getattr(kernels, name), getattr(plain, name)
+        np.testing.assert_allclose(found, known, atol=2e-3 * np.abs(known).max())
+    np.testing.assert_array_equal(kernels.steps, plain.steps)
+
+
+def test_what_a_mask_ignores_has_no_part_in_the_curvature() -> None:
+    level = masked(level_of(cloud(80, 40, 30, degree=1)), IGNORE)
+    given = StepInput(level, RasterSettings(), RATES, weight=4.0, gauss_newton=GaussNewton(1))
+    picture = HostStep.sign_picture(given)
+    assert picture is not None
+    assert level.mask is not None
+    assert (np.abs(picture) == 2.0 * (level.mask > 0)).all()
 
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])

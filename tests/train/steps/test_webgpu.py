@@ -15,6 +15,7 @@ from stages.raster.webgpu import device
 from stages.raster.webgpu.rasteriser import WebGpuRasteriser
 from stages.scene import IGNORE, TRANSPARENT
 from stages.train.dropout import Dropout
+from stages.train.gauss_newton import GaussNewton
 from stages.train.optimiser import LearningRates, Model, empty_model
 from stages.train.steps.device_model import DeviceModel
 from stages.train.steps.reference import ReferenceStep
@@ -43,8 +44,9 @@ def test_steps_leave_what_the_definition_leaves(degree):
         model = start()
         model.smoothing[:], model.sh_degrees[:4] = 0.02, 0
         step.load(model)
-    for dropout in (None, None, Dropout(5, 7)):
-        given = StepInput(level(), settings, RATES, True, dropout)
+    drops, one, other = Dropout(5, 7), GaussNewton(1), GaussNewton(2)
+    for dropout, moves in ((None, None), (drops, None), (None, one), (drops, other), (None, other)):
+        given = StepInput(level(), settings, RATES, True, dropout, gauss_newton=moves)
         losses = [s.step(given) for s in (found, plain)]
         assert losses[0] == pytest.approx(losses[1], rel=1e-5)
     for name, wanted in vars(plain.model()).items():
@@ -60,10 +62,13 @@ def test_masks_and_light_ask_what_the_definition_asks(seen):
     settings = RasterSettings(near=0.1, sh_degree=0, background=(0.2, 0.9, 0.4))
     plain, found = ReferenceStep(ReferenceRasteriser()), stepper()
     plain.load(start())
-    losses = [s.step(StepInput(seen, settings, RATES, weight=4.0)) for s in (found, plain)]
+    given = StepInput(seen, settings, RATES, weight=4.0, gauss_newton=GaussNewton(5))
+    losses = [s.step(given) for s in (found, plain)]
     assert losses[0] == pytest.approx(losses[1], rel=1e-5)
-    wanted = plain.model().moment1
-    np.testing.assert_allclose(found.model().moment1, wanted, atol=2e-5 * np.abs(wanted).max())
+    for name in ("moment1", "moment2"):
+        here, wanted = (getattr(s.model(), name) for s in (found, plain))
+        assert wanted.any()
+        np.testing.assert_allclose(here, wanted, atol=2e-5 * np.abs(wanted).max())
 
 
 def test_two_runs_leave_the_same_bytes():

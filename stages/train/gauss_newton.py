@@ -1,0 +1,43 @@
+"""Steps by the diagonal of J^T J, in place of Adam's once densification has ended.
+
+Adam divides a gradient by the root of its mean square, so a parameter moves by its learning rate
+however well the photographs determine it. J, the derivatives of the picture's values by the
+parameters, says how well: J^T J is the Gauss-Newton approximation of the second derivatives of half
+the squared error. A backward pass of a picture of random signs gives J^T z, and the mean square of
+its entries is the diagonal h (Hutchinson 1989). The step of a parameter is
+
+    m / (DAMPING h + EPSILON), at most its learning rate,
+
+where m is Adam's first moment and h an average over measurements, which takes the place of Adam's
+second moment in `Model.moment2`. This is a diagonal trust region, as in Sophia (Liu et al. 2023,
+2305.14342) and 3DGS2-TR (2602.00395). A parameter whose h is not known yet does not move.
+
+DAMPING is more than 1 because splats that overlap move together, and because the slope of an
+absolute error r is that of a squared one with the curvature 1 / r.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.train.random_bits import signs
+
+DAMPING = 300.0
+CURVATURE_DECAY = 0.95  # of the average, each time that a splat is measured
+INTERVAL = 4  # steps from one measurement to the next, which costs a backward pass
+
+
+@dataclass(frozen=True)
+class GaussNewton:
+    """That a step moves by h. key: 32 random bits for the signs if it measures h before, else
+    None."""
+
+    key: int | None = None
+
+
+def sign_picture(shape: tuple[int, ...], key: int, weight: float) -> NDArray[np.float32]:
+    """[3, H, W] the random signs, for a loss whose gradients are multiplied by `weight`."""
+    return signs(shape, key) * np.float32(weight**0.5)
