@@ -4,13 +4,14 @@ Adam divides a gradient by the root of its mean square, so a parameter moves by 
 however well the photographs determine it. J, the derivatives of the picture's values by the
 parameters, says how well: J^T J is the Gauss-Newton approximation of the second derivatives of half
 the squared error. A backward pass of a picture of random signs gives J^T z, and the mean square of
-its entries is the diagonal h (Hutchinson 1989). The step of a parameter is
+its entries is the diagonal h (Hutchinson 1989). The step of a parameter with the learning rate r is
 
-    m / (DAMPING h + EPSILON), at most its learning rate,
+    r m / (DAMPING r h + EPSILON), at most r,
 
 where m is Adam's first moment and h an average over measurements, which takes the place of Adam's
 second moment in `Model.moment2`. This is a diagonal trust region, as in Sophia (Liu et al. 2023,
-2305.14342) and 3DGS2-TR (2602.00395). A parameter whose h is not known yet does not move.
+2305.14342) and 3DGS2-TR (2602.00395). EPSILON, Adam's own, keeps rounding noise from moving what
+hardly shows. A parameter whose h is not known yet does not move.
 
 DAMPING is more than 1 because splats that overlap move together, and because the slope of an
 absolute error r is that of a squared one with the curvature 1 / r.

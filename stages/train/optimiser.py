@@ -171,17 +171,17 @@ def _update_moments(gradients, at, columns, moment1, moment2, own, rates, scales
 def _damped_steps(
     gradients, at, columns, moment1, curvature, own, rates, units, scales, counts, shift
 ):
-    """As `_update_moments`, by the curvature, which does not change: see `gauss_newton`. units: of
-    what a parameter's derivatives are by."""
+    """As `_update_moments`, by the curvature, which does not change: see `gauss_newton`. units:
+    factors from rates to the units of what derivatives are by."""
     b1, c1 = splat16(_F(BETA1)), splat16(_F(1.0 - BETA1))
     damping, epsilon, zero = splat16(_F(DAMPING)), splat16(_F(EPSILON)), splat16(_F(0.0))
     for k in range(0, columns, 16):
         m = vfma(b1, vload(moment1, own + k), c1 * vload(gradients, at + k))
         vstore(moment1, own + k, m)
         scale1, _ = _scales_of(scales, counts, k)
-        h, most = vload(curvature, own + k), vload(rates, k)
-        step = vload(units, k) * m * scale1 / vfma(damping, h, epsilon)
-        step = vmax(vmin(step, most), zero - most)
+        h, rate = vload(curvature, own + k), vload(rates, k)
+        step = rate * m * scale1 / vfma(damping * h, rate * vload(units, k), epsilon)
+        step = vmax(vmin(step, rate), zero - rate)
         vstore(shift, k, vselect(vgt(h, zero), step, zero))
 
 
@@ -271,7 +271,7 @@ def adam_step(
             _count(steps, i, counts, corrections, scales)
             at, own = rank * columns, np.int64(i) * row_width
             if gauss_newton:
-                units[MEAN:ROTATION] = extent / distances[i]
+                units[MEAN:ROTATION] = distances[i] / extent
                 _damped_steps(
                     gradients,
                     *(at, columns, moment1, moment2, own, rates, units, scales, counts, shift),

@@ -146,8 +146,36 @@ def test_a_step_is_the_damped_newton_step_and_at_most_the_learning_rate(root: fl
     found = moved(m, gradients)
     rate = np.tile(RATES.row(4)[:USED], (3, 1)).astype(np.float64)
     rate[:, MEAN:ROTATION] *= m.distances[:, None]
-    newton = gradients[:, None] / (DAMPING * root**2 + EPSILON)
+    newton = rate * gradients[:, None] / (DAMPING * root**2 * rate + EPSILON)
     np.testing.assert_allclose(found, np.clip(newton, -rate, rate), rtol=1e-4, atol=3e-7)
+
+
+def test_noise_far_below_any_signal_hardly_moves_a_splat() -> None:
+    """Gradients and derivatives of 1e-10 in the units of the mean loss of 150,000 pixels."""
+    m, r, noise = model(1), np.random.default_rng(0), 1e-10 * 150_000
+    before = np.concatenate([array.reshape(-1) for array in m.arrays])
+    for _ in range(300):
+        measure_curvature(Pool(1), m, backward(noise * r.normal(size=1)), extent=1.0)
+        moved(m, noise * r.normal(size=1))
+    after = np.concatenate([array.reshape(-1) for array in m.arrays])
+    assert (np.abs(after - before) < 5 * RATES.row(4)[:USED]).all()
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
+@pytest.mark.parametrize("scale", [1e-5, 1.0, 1e11])
+def test_a_step_does_not_depend_on_the_unit_of_length(unit: float, scale: float) -> None:
+    def of(unit: float) -> NDArray[np.floating]:
+        m, given = model(), [backward(np.full(3, scale)) for _ in range(2)]
+        m.means[:], m.distances[:] = 0.0, 3.0
+        for each in given:
+            each.parameters[:, MEAN:ROTATION] /= unit
+        measure_curvature(Pool(1), m, given[0], extent=unit)
+        rates = RATES.scaled(0.01 * unit, 1.0, unit)
+        apply_gradients(Pool(1), m, given[1], 4, rates, 100, 50, gauss_newton=True)
+        return m.means / unit
+
+    assert of(1.0).any()
+    np.testing.assert_allclose(of(unit), of(1.0), rtol=1e-4)
 
 
 def test_it_settles_where_the_slope_is_zero_however_steep_the_parameters_are() -> None:

@@ -210,8 +210,10 @@ def adam_kernel(
     distance = tl.load(distances + i, mask=moved, other=1.0)
     rate = tl.where((k < ROTATION)[None, :], rate[None, :] * distance[:, None], rate[None, :])
     if GAUSS_NEWTON:
-        step = tl.where(k < ROTATION, extent, 1.0)[None, :] * m / (DAMPING * v + EPSILON)
-        step = tl.where(v > 0.0, tl.minimum(tl.maximum(step, -rate), rate), 0.0)
+        unit = tl.where(k < ROTATION, 1.0 / extent, 1.0)[None, :]
+        share = m / (DAMPING * v * rate * unit + EPSILON)
+        share = tl.minimum(tl.maximum(share, -1.0), 1.0)
+        step = tl.where(v > 0.0, rate * share, 0.0)
     else:
         v = BETA2 * v + REST2 * g * g
         tl.store(moment2 + at, v, mask=there)

@@ -133,9 +133,9 @@ def update(
     rate[:, MEAN:ROTATION] *= model.distances[rows, None]
     if gauss_newton:
         h = model.moment2[rows, :columns].astype(np.float64)
-        shift = m / (DAMPING * h + EPSILON)
-        shift[:, MEAN:ROTATION] *= rates.extent
-        shift = np.where(h > 0, np.clip(shift, -rate, rate), 0.0)
+        h[:, MEAN:ROTATION] /= rates.extent
+        shift = rate * np.clip(m / (DAMPING * h * rate + EPSILON), -1.0, 1.0)
+        shift = np.where(h > 0, shift, 0.0)
     else:
         v = BETA2 * model.moment2[rows, :columns] + (1 - BETA2) * g * g
         model.moment2[rows, :columns] = v

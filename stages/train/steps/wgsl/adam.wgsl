@@ -78,9 +78,9 @@ fn adam(at_work: Place) {
         var step = 0.0;
         if (p.gauss_newton != 0u) {
             let h = moment2[at];
-            let unit = select(1.0, p.extent, k < ROTATION);
-            let newton = clamp(unit * first / (DAMPING * h + EPSILON), -rate, rate);
-            step = select(0.0, newton, h > 0.0);
+            let own_rate = select(rate, rate / p.extent, k < ROTATION);
+            let share = clamp(first / (DAMPING * h * own_rate + EPSILON), -1.0, 1.0);
+            step = select(0.0, rate * share, h > 0.0);
         } else {
             let v = BETA2 * moment2[at] + (1.0 - BETA2) * g * g;
             moment2[at] = v;
