@@ -28,6 +28,9 @@ from stages.train.random_bits import signs
 
 DAMPING = 300.0
 CURVATURE_DECAY = 0.95  # of the average, each time that a splat is measured
+# x the learning rate of opacities: where one is near 0 or 1, slope and curvature both vanish, and a
+# step is as large as the rate. With the whole rate, noise makes splats transparent for good.
+OPACITY_RATE = 0.1
 INTERVAL = 4  # steps from one measurement to the next, which costs a backward pass
 
 

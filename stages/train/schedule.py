@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stages.train.gauss_newton import INTERVAL, GaussNewton
+from stages.train.gauss_newton import INTERVAL, OPACITY_RATE, GaussNewton
 from stages.train.optimiser import LearningRates
 
 PUBLISHED_STEPS = 30_000
@@ -97,13 +97,16 @@ class Schedule:
 
     def rates(self, step: int) -> LearningRates:
         """The learning rates of `step`: that of the means decays exponentially over the run, all
-        others from RATE_DECAY_FROM on."""
+        others from RATE_DECAY_FROM on; that of opacities falls when densification ends."""
         first = MEANS_LR * self.raised(RATES_POWER)
         last = MEANS_LR_END * self.raised(MEANS_END_POWER)
         means = first * (last / first) ** self.share(step)
         decay = max(0.0, (self.share(step) - RATE_DECAY_FROM) / (1.0 - RATE_DECAY_FROM))
         factor = self.raised(RATES_POWER) * RATE_DECAY_END**decay
-        return LearningRates().scaled(means * self.extent, factor, self.extent)
+        rates = LearningRates().scaled(means * self.extent, factor, self.extent)
+        if self.densifying(step):
+            return rates
+        return replace(rates, opacity_logits=OPACITY_RATE * rates.opacity_logits)
 
     def active_sh_degree(self, step: int) -> int:
         """One degree more every 1000 of 30,000 steps."""
