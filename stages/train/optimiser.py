@@ -221,7 +221,7 @@ def _move(i, shift, means, quaternions, log_scales, opacity_logits, sh, n_sh):
 
 
 @kernel
-def adam_step(
+def move_splats(
     ticket,
     chunk,
     visible,
@@ -448,7 +448,7 @@ def apply_gradients(
     _in_extents(backward, rates.extent)
     flat = replace(model, sh=model.sh.reshape(len(model), 3 * model.sh.shape[1]))
     pool.share(
-        *(adam_step, CHUNK, backward.rows, backward.parameters, backward.means2d),
+        *(move_splats, CHUNK, backward.rows, backward.parameters, backward.means2d),
         *(tuple(vars(flat).values()), active_counts(coefficients), _CORRECTIONS),
         rates.row(coefficients),
         *(np.float32(0.5 * width / pixels), np.float32(0.5 * height / pixels)),

@@ -185,7 +185,7 @@ def sweep(results: Results, toy: bool) -> None:
         for module, name, choices in (
             (project, "project_kernel", (2, 8)),
             (gradients, "splat_gradient_kernel", (2, 8)),
-            (gpu_kernels, "adam_kernel", (2, 8)),
+            (gpu_kernels, "move_kernel", (2, 8)),
             (blend, "blend_kernel", (2, 4)),
             (blend, "blend_gradient_kernel", (2, 4)),
         ):

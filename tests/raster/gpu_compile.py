@@ -56,7 +56,7 @@ KERNELS: tuple[tuple[Any, dict[str, Any], dict[str, Any]], ...] = (
     (gpu_kernels.similarity_kernel, {"BLOCK": 256}, {}),
     (gpu_kernels.slope_rows_kernel, {"BLOCK": 256}, {}),
     (gpu_kernels.loss_gradient_kernel, {"BLOCK": 256}, {}),
-    *((gpu_kernels.adam_kernel, {**_ROWS, "GAUSS_NEWTON": moves}, {}) for moves in (False, True)),
+    *((gpu_kernels.move_kernel, {**_ROWS, "GAUSS_NEWTON": moves}, {}) for moves in (False, True)),
     (gpu_kernels.average_squares_kernel, _ROWS, {}),
 )
 

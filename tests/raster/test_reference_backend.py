@@ -22,8 +22,8 @@ except SystemExit as end:
     assert not end.code, end.code
 loaded = [name for name in sys.modules if name.startswith("stages.raster.cpu.")]
 from stages.train.steps.loss_kernels import loss_strips
-from stages.train.optimiser import adam_step
-called = [k.__name__ for k in (loss_strips, adam_step) if k.signatures]
+from stages.train.optimiser import move_splats
+called = [k.__name__ for k in (loss_strips, move_splats) if k.signatures]
 print(json.dumps({"event": "kernels", "loaded": loaded, "called": called}))
 """
 _TINY = (

@@ -235,7 +235,7 @@ class GpuStep:
         results = torch.stack([loss.double(), drawn.lists.total[0].double()])
         self.skipped += drawn.lists.total > room
         # last, because what needs memory may be repeated
-        self._adam(drawn, view, parameters, means2d, given, room)
+        self._move(drawn, view, parameters, means2d, given, room)
         self._on_host = None
         self._arrivals.send(results)
         return self._arrivals.read()
@@ -264,7 +264,7 @@ class GpuStep:
             self._targets[key] = gpu_target_of(level, self.device)
         return self._targets[key]
 
-    def _adam(
+    def _move(
         self,
         drawn: Drawn,
         view: DeviceView,
@@ -281,7 +281,7 @@ class GpuStep:
         parameters[:, :ROTATION] *= rates.extent
         block = 4096 if interpreted() else 16
         pixels = view.width * view.height
-        gpu_kernels.adam_kernel[(triton.cdiv(n, block),)](
+        gpu_kernels.move_kernel[(triton.cdiv(n, block),)](
             *(scene.rows, held["moment1"], held["moment2"], held["steps"], parameters, means2d),
             *(drawn.keys, held["gradient_sum"], held["gradient_count"], held["distances"]),
             self._corrections,

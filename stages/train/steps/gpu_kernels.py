@@ -157,7 +157,7 @@ def group_of(k):
     do_not_specialize=["room", "n", "used", "active"],
     do_not_specialize_on_alignment=["total"],
 )
-def adam_kernel(
+def move_kernel(
     rows,
     moment1,
     moment2,
@@ -188,9 +188,9 @@ def adam_kernel(
     BLOCK: tl.constexpr,
     GAUSS_NEWTON: tl.constexpr,
 ):
-    """Move the visible splats: see `optimiser.adam_step`. rows, moments and gradients [n, COLUMNS],
-    of which `used` columns and the first `active` counts take part. WIDTH: a power of two that
-    holds a row. GAUSS_NEWTON: whether to move by the curvature in moment2.
+    """Move the visible splats: see `move_splats` in `optimiser`. rows, moments and gradients [n,
+    COLUMNS], of which `used` columns and the first `active` counts take part. WIDTH: a power of two
+    that holds a row. GAUSS_NEWTON: whether to move by the curvature in moment2.
 
     Nothing moves where the lists held more entries (total) than there was room for.
     """
@@ -238,7 +238,7 @@ def average_squares_kernel(
     BLOCK: tl.constexpr,
 ):
     """Add the squares of derivatives to the averages of the visible splats: see
-    `optimiser.average_squares`; arguments as for `adam_kernel`."""
+    `optimiser.average_squares`; arguments as for `move_kernel`."""
     _, _, at, _, there, d = usable(derivatives, keys, total, room, n, used, COLUMNS, WIDTH, BLOCK)
     h = tl.load(curvature + at, mask=there, other=0.0)
     h = tl.where(h > 0.0, CURVATURE_DECAY * h + REST_CURVATURE * d * d, d * d)

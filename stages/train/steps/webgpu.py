@@ -30,9 +30,9 @@ from stages.train.views import Level
 
 LAG = 8  # steps after which the host reads the results of a step
 SPARE = 1.5  # room for the lists, relative to the largest number so far
-_ADAM, _SQUARES, _SIGNS, _MOST, _DROP = (
+_MOVE, _SQUARES, _SIGNS, _MOST, _DROP = (
     Kernel(FILE, entry, CONSTANTS)
-    for entry in ("adam", "average_squares", "sign_picture", "largest_count", "drop_out")
+    for entry in ("move_splats", "average_squares", "sign_picture", "largest_count", "drop_out")
 )
 
 
@@ -108,7 +108,7 @@ class WebGpuStep:
             derivatives, _ = self.rasteriser.gradients(scene, view, drawn, signs)
             self._measure(drawn, view, given.rates.extent, derivatives)
         gradients, means2d = self.rasteriser.gradients(scene, view, drawn, v_image)
-        self._adam(drawn, view, given, gradients, means2d)
+        self._move(drawn, view, given, gradients, means2d)
         self._held.moved()
         self._on_host = None
         gpu.copy(drawn.lists.ends, self._loss.sums, 1, (len(scene), 5))
@@ -156,7 +156,7 @@ class WebGpuStep:
         self.gpu.run(_DROP, -(-n // 256), (state, most, rows), given)
         return replace(scene, rows=rows)
 
-    def _adam(
+    def _move(
         self, drawn: Drawn, view: DeviceView, given: StepInput, gradients: Any, means2d: Any
     ) -> None:
         scene, rates, n = self._held.scene, given.rates, len(self._held)
@@ -168,7 +168,7 @@ class WebGpuStep:
             int(given.gauss_newton is not None),
         )
         buffers = (gradients, means2d, drawn.keys, drawn.lists.ends, scene.rows)
-        self.gpu.run(_ADAM, -(-n // 16), (*buffers, *self._held.moments, self._held.state), numbers)
+        self.gpu.run(_MOVE, -(-n // 16), (*buffers, *self._held.moments, self._held.state), numbers)
 
     def _signs(self, photograph: Any, level: Level, key: int, weight: float) -> Any:
         """[3, H, W] in a buffer, until the next one: see `gauss_newton.sign_picture`."""
@@ -188,7 +188,7 @@ class WebGpuStep:
     def _sizes(
         self, drawn: Drawn, view: DeviceView, extent: float
     ) -> tuple[int, int, int, int, int, float]:
-        """What `Step` in adam.wgsl begins with."""
+        """What `Step` in optimiser.wgsl begins with."""
         scene, coefficients = self._held.scene, view.coefficients(self._held.scene)
         return (
             *(len(scene), scene.columns, gradient_columns(coefficients)),

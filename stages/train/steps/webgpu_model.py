@@ -37,7 +37,7 @@ _STATE: dict[str, tuple[str, int, int, Any]] = {
     "sh_degrees": ("state", SH_DEGREE, 1, np.uint32),
 }
 _FLAT = frozenset(name for name, place in (_PARAMETERS | _STATE).items() if place[2] == 1)
-FILE = Path(__file__).parent / "wgsl" / "adam.wgsl"
+FILE = Path(__file__).parent / "wgsl" / "optimiser.wgsl"
 CONSTANTS: tuple[tuple[str, float], ...] = (
     *(("NEW", NEW), ("STATE", STATE), ("GRADIENT_COUNT", GRADIENT_COUNT)),
     *(("GRADIENT_SUM", GRADIENT_SUM), ("DISTANCE", DISTANCE), ("SH_DEGREE", SH_DEGREE)),

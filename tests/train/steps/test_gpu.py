@@ -131,7 +131,7 @@ def test_a_steady_step_never_waits_for_the_device(seen, dropout, monkeypatch):
 @pytest.mark.skipif(not device.interpreted(), reason="a device refuses other numbers itself")
 def test_kernels_are_given_plain_numbers_and_aligned_tensors(monkeypatch):
     """A device takes no NumPy numbers, and a tensor at an odd address would compile a kernel anew,
-    but for `adam_kernel`'s `total`."""
+    but for `move_kernel`'s `total`."""
     import triton.language as tl
     from triton.runtime.interpreter import GridExecutor
 

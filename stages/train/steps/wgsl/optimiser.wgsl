@@ -59,7 +59,7 @@ fn gradient(first: u32, k: u32) -> f32 {
 
 // Move the visible splats, 16 in a group, with 16 lanes for the columns of each.
 @compute @workgroup_size(256)
-fn adam(at_work: Place) {
+fn move_splats(at_work: Place) {
     let lane = at_work.lane % 16u;
     let own_row = at_work.lane / 16u;
     let i = group_of(at_work) * 16u + own_row;
