@@ -441,9 +441,14 @@ def apply_gradients(
     height: int,
     gauss_newton: bool = False,
 ) -> None:
-    """One step of Adam on `model`, or one by the curvature in its `moment2`, in place; gradients by
-    means become those per extent. coefficients: number of SH coefficients that the gradients
-    hold."""
+    """One step on `model`, in place; gradients by means become those per extent.
+
+    Args:
+        coefficients: number of SH coefficients that the gradients hold.
+        rates: learning rates.
+        width, height: of the picture.
+        gauss_newton: whether to move by the curvature in `model.moment2`, or else as Adam.
+    """
     pixels = width * height
     _in_extents(backward, rates.extent)
     flat = replace(model, sh=model.sh.reshape(len(model), 3 * model.sh.shape[1]))

@@ -37,7 +37,7 @@ class StepInput:
         rates: learning rates.
         smooth: whether to render with the model's smoothing widths.
         dropout: drops splats from this step; None for none.
-        use_gradients: is called with the model and its gradients before Adam changes the model;
+        use_gradients: is called with the model and its gradients before the step changes the model;
             only steps on the host do this.
         weight: factor of all gradients, not of the loss that a step returns.
         gauss_newton: to move by the curvature; None to move as Adam.
