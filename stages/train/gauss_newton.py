@@ -6,14 +6,14 @@ parameters, says how well: J^T J is the Gauss-Newton approximation of the second
 the squared error. A backward pass of a picture of random signs gives J^T z, and the mean square of
 its entries is the diagonal h (Hutchinson 1989). The step of a parameter with the learning rate r is
 
-    r m / (DAMPING r h + EPSILON), at most r,
+    r m / (damping r h + EPSILON), at most r,
 
 where m is Adam's first moment and h an average over measurements, which takes the place of Adam's
 second moment in `Model.moment2`. This is a diagonal trust region, as in Sophia (Liu et al. 2023,
 2305.14342) and 3DGS2-TR (2602.00395). EPSILON, Adam's own, keeps rounding noise from moving what
 hardly shows. A parameter whose h is not known yet does not move.
 
-DAMPING is more than 1 because splats that overlap move together, and because the slope of an
+The damping is more than 1 because splats that overlap move together, and because the slope of an
 absolute error r is that of a squared one with the curvature 1 / r.
 """
 
@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 
 from stages.train.random_bits import signs
 
-DAMPING = 300.0
+# Of a run of the published length. A shorter one divides it by what multiplies its learning rates.
+DAMPING = 1400.0
 CURVATURE_DECAY = 0.95  # of the average, each time that a splat is measured
 # x the learning rate of opacities: where one is near 0 or 1, slope and curvature both vanish, and a
 # step is as large as the rate. With the whole rate, noise makes splats transparent for good.
@@ -36,9 +37,14 @@ INTERVAL = 4  # steps from one measurement to the next, which costs a backward p
 
 @dataclass(frozen=True)
 class GaussNewton:
-    """That a step moves by h. key: 32 random bits for the signs if it measures h before, else
-    None."""
+    """That a step moves by h.
 
+    Args:
+        damping: see the module.
+        key: 32 random bits for the signs if the step measures h before it moves, else None.
+    """
+
+    damping: float
     key: int | None = None
 
 

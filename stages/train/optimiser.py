@@ -50,7 +50,7 @@ from stages.scene import Camera
 from stages.scene.morton import morton_order_of
 from stages.seed.neighbours import nearest_distance
 from stages.train.free_space import FreeSpace
-from stages.train.gauss_newton import CURVATURE_DECAY, DAMPING
+from stages.train.gauss_newton import CURVATURE_DECAY
 
 BETA1, BETA2 = 0.9, 0.999
 # Gradients are those of H x W x loss (see `loss`), so this is about 1e-9 in the units of the mean
@@ -169,18 +169,18 @@ def _update_moments(gradients, at, columns, moment1, moment2, own, rates, scales
 
 @kernel
 def _damped_steps(
-    gradients, at, columns, moment1, curvature, own, rates, units, scales, counts, shift
+    gradients, at, columns, moment1, curvature, own, rates, units, scales, counts, shift, damping
 ):
     """As `_update_moments`, by the curvature, which does not change: see `gauss_newton`. units:
     factors from rates to the units of what derivatives are by."""
     b1, c1 = splat16(_F(BETA1)), splat16(_F(1.0 - BETA1))
-    damping, epsilon, zero = splat16(_F(DAMPING)), splat16(_F(EPSILON)), splat16(_F(0.0))
+    epsilon, zero = splat16(_F(EPSILON)), splat16(_F(0.0))
     for k in range(0, columns, 16):
         m = vfma(b1, vload(moment1, own + k), c1 * vload(gradients, at + k))
         vstore(moment1, own + k, m)
         scale1, _ = _scales_of(scales, counts, k)
         h, rate = vload(curvature, own + k), vload(rates, k)
-        step = rate * m * scale1 / vfma(damping * h, rate * vload(units, k), epsilon)
+        step = rate * m * scale1 / vfma(splat16(damping) * h, rate * vload(units, k), epsilon)
         step = vmax(vmin(step, rate), zero - rate)
         vstore(shift, k, vselect(vgt(h, zero), step, zero))
 
@@ -234,7 +234,7 @@ def move_splats(
     ndc_x,
     ndc_y,
     extent,
-    gauss_newton,
+    damping,
 ):
     """Update the visible splats; accumulate the norm of the gradient by their 2D positions.
 
@@ -250,7 +250,7 @@ def move_splats(
             `Model.distances`.
         ndc_x, ndc_y: factors from a gradient per pixel to the units of the densification threshold.
         extent: of the scene, which gradients by means are multiplied by.
-        gauss_newton: whether to move by the curvature in moment2, or else as Adam.
+        damping: see `gauss_newton`; 0 to move as Adam.
     """
     means, quaternions, log_scales, opacity_logits, sh, sh_degrees = model[:6]
     moment1, moment2, steps, gradient_sum, gradient_count = model[6:11]
@@ -270,11 +270,12 @@ def move_splats(
                 continue
             _count(steps, i, counts, corrections, scales)
             at, own = rank * columns, np.int64(i) * row_width
-            if gauss_newton:
+            if damping > 0.0:
                 units[MEAN:ROTATION] = distances[i] / extent
                 _damped_steps(
                     gradients,
                     *(at, columns, moment1, moment2, own, rates, units, scales, counts, shift),
+                    damping,
                 )
             else:
                 _update_moments(
@@ -439,7 +440,7 @@ def apply_gradients(
     rates: LearningRates,
     width: int,
     height: int,
-    gauss_newton: bool = False,
+    damping: float = 0.0,
 ) -> None:
     """One step on `model`, in place; gradients by means become those per extent.
 
@@ -447,7 +448,7 @@ def apply_gradients(
         coefficients: number of SH coefficients that the gradients hold.
         rates: learning rates.
         width, height: of the picture.
-        gauss_newton: whether to move by the curvature in `model.moment2`, or else as Adam.
+        damping: to move by the curvature in `model.moment2`, see `gauss_newton`; 0 to move as Adam.
     """
     pixels = width * height
     _in_extents(backward, rates.extent)
@@ -457,7 +458,7 @@ def apply_gradients(
         *(tuple(vars(flat).values()), active_counts(coefficients), _CORRECTIONS),
         rates.row(coefficients),
         *(np.float32(0.5 * width / pixels), np.float32(0.5 * height / pixels)),
-        *(np.float32(rates.extent), gauss_newton),
+        *(np.float32(rates.extent), np.float32(damping)),
     )
 
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stages.train.gauss_newton import INTERVAL, OPACITY_RATE, GaussNewton
+from stages.train.gauss_newton import DAMPING, INTERVAL, OPACITY_RATE, GaussNewton
 from stages.train.optimiser import LearningRates
 
 PUBLISHED_STEPS = 30_000
@@ -154,9 +154,11 @@ class Schedule:
         """How `step` moves: None while the model is densified."""
         if self.densifying(step):
             return None
+        damping = DAMPING / self.raised(RATES_POWER)
         if step % INTERVAL:
-            return GaussNewton()
-        return GaussNewton(int(np.random.default_rng([self.seed, 5, step]).integers(1 << 32)))
+            return GaussNewton(damping)
+        key = int(np.random.default_rng([self.seed, 5, step]).integers(1 << 32))
+        return GaussNewton(damping, key)
 
     def dropout_key(self, step: int) -> int:
         """32 random bits for `dropout.Dropout`."""

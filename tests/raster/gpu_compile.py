@@ -36,7 +36,7 @@ WHOLE = (
     *("n", "width", "height", "tiles_x", "tiles", "capacity", "entries", "room"),
     *("columns", "used", "active", "largest_step", "tile"),
 )
-REALS = ("red", "green", "blue", "weight", "unit", "ndc_x", "ndc_y", "extent")
+REALS = ("red", "green", "blue", "weight", "unit", "ndc_x", "ndc_y", "extent", "damping")
 SCENE = {"COEFFICIENTS": 16, "SMOOTH": False, "ANTIALIAS": False}
 SIZES = {"TILE": 16, "BLOCK": 128, "REAL": tl.float64}
 _ROWS = {"BLOCK": 16, "COLUMNS": 64, "WIDTH": 64}

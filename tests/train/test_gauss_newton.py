@@ -21,7 +21,7 @@ from stages.raster.definition import (
 )
 from stages.raster.kernels.pool import Pool
 from stages.scene import DrawSettings
-from stages.train.gauss_newton import CURVATURE_DECAY, DAMPING, INTERVAL, sign_picture
+from stages.train.gauss_newton import CURVATURE_DECAY, INTERVAL, sign_picture
 from stages.train.hooks import Curvature
 from stages.train.optimiser import (
     EPSILON,
@@ -39,6 +39,7 @@ from tests.train.pictures import trainer_of, view_of
 
 RATES = LearningRates(means=0.01)
 USED = used_columns(4)
+DAMPED = 300.0
 
 
 def model(n: int = 3) -> Model:
@@ -58,7 +59,7 @@ def backward(values: NDArray[np.floating]) -> Backward:
 def moved(m: Model, gradients: NDArray[np.floating], rates: LearningRates = RATES):
     """[M, USED] by how much one step lowers each parameter."""
     before = np.concatenate([array.reshape(len(m), -1) for array in m.arrays], 1)
-    apply_gradients(Pool(1), m, backward(gradients), 4, rates, 100, 50, gauss_newton=True)
+    apply_gradients(Pool(1), m, backward(gradients), 4, rates, 100, 50, damping=DAMPED)
     after = np.concatenate([array.reshape(len(m), -1) for array in m.arrays], 1)
     return (before - after)[: len(gradients)]
 
@@ -146,7 +147,7 @@ def test_a_step_is_the_damped_newton_step_and_at_most_the_learning_rate(root: fl
     found = moved(m, gradients)
     rate = np.tile(RATES.row(4)[:USED], (3, 1)).astype(np.float64)
     rate[:, MEAN:ROTATION] *= m.distances[:, None]
-    newton = rate * gradients[:, None] / (DAMPING * root**2 * rate + EPSILON)
+    newton = rate * gradients[:, None] / (DAMPED * root**2 * rate + EPSILON)
     np.testing.assert_allclose(found, np.clip(newton, -rate, rate), rtol=1e-4, atol=3e-7)
 
 
@@ -171,7 +172,7 @@ def test_a_step_does_not_depend_on_the_unit_of_length(unit: float, scale: float)
             each.parameters[:, MEAN:ROTATION] /= unit
         measure_curvature(Pool(1), m, given[0], extent=unit)
         rates = RATES.scaled(0.01 * unit, 1.0, unit)
-        apply_gradients(Pool(1), m, given[1], 4, rates, 100, 50, gauss_newton=True)
+        apply_gradients(Pool(1), m, given[1], 4, rates, 100, 50, damping=DAMPED)
         return m.means / unit
 
     assert of(1.0).any()
@@ -190,10 +191,10 @@ def test_it_settles_where_the_slope_is_zero_however_steep_the_parameters_are() -
             measured = backward(np.zeros(1))
             measured.parameters[0, :USED] = np.sqrt(slopes)
             measure_curvature(Pool(1), m, measured, extent=1.0)
-        apply_gradients(Pool(1), m, gradient, 4, RATES, 100, 50, gauss_newton=True)
+        apply_gradients(Pool(1), m, gradient, 4, RATES, 100, 50, damping=DAMPED)
     now = np.concatenate([array.reshape(1, -1) for array in m.arrays], 1)[0]
     # a step below half of the last digit of a value up to 4 is lost
-    np.testing.assert_allclose(now, wanted, atol=DAMPING * 2.4e-7)
+    np.testing.assert_allclose(now, wanted, atol=DAMPED * 2.4e-7)
 
 
 def test_it_moves_once_densification_has_ended_and_measures_in_one_of_so_many_steps() -> None:

@@ -40,6 +40,6 @@ class CpuStep(HostStep):
             given.use_gradients(self._model, backward)
         apply_gradients(
             *(pool, self._model, backward, (settings.sh_degree + 1) ** 2, given.rates),
-            *(level.camera.width, level.camera.height, given.gauss_newton is not None),
+            *(level.camera.width, level.camera.height, self.damping(given)),
         )
         return loss.value

@@ -22,7 +22,6 @@ C1, C2 = tl.constexpr(float(loss_kernels.C1)), tl.constexpr(float(loss_kernels.C
 BETA1, BETA2 = tl.constexpr(optimiser.BETA1), tl.constexpr(optimiser.BETA2)
 REST1, REST2 = tl.constexpr(1.0 - optimiser.BETA1), tl.constexpr(1.0 - optimiser.BETA2)
 EPSILON = tl.constexpr(optimiser.EPSILON)
-DAMPING = tl.constexpr(gauss_newton.DAMPING)
 CURVATURE_DECAY = tl.constexpr(gauss_newton.CURVATURE_DECAY)
 REST_CURVATURE = tl.constexpr(1.0 - gauss_newton.CURVATURE_DECAY)
 LARGEST = tl.constexpr(optimiser.LARGEST_GRADIENT)
@@ -183,6 +182,7 @@ def move_kernel(
     ndc_x,
     ndc_y,
     extent,
+    damping,
     COLUMNS: tl.constexpr,
     WIDTH: tl.constexpr,
     BLOCK: tl.constexpr,
@@ -190,7 +190,7 @@ def move_kernel(
 ):
     """Move the visible splats: see `move_splats` in `optimiser`. rows, moments and gradients [n,
     COLUMNS], of which `used` columns and the first `active` counts take part. WIDTH: a power of two
-    that holds a row. GAUSS_NEWTON: whether to move by the curvature in moment2.
+    that holds a row. GAUSS_NEWTON: whether to move by the curvature in moment2, with `damping`.
 
     Nothing moves where the lists held more entries (total) than there was room for.
     """
@@ -211,7 +211,7 @@ def move_kernel(
     rate = tl.where((k < ROTATION)[None, :], rate[None, :] * distance[:, None], rate[None, :])
     if GAUSS_NEWTON:
         unit = tl.where(k < ROTATION, 1.0 / extent, 1.0)[None, :]
-        share = m / (DAMPING * v * rate * unit + EPSILON)
+        share = m / (damping * v * rate * unit + EPSILON)
         share = tl.minimum(tl.maximum(share, -1.0), 1.0)
         step = tl.where(v > 0.0, rate * share, 0.0)
     else:

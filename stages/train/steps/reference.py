@@ -26,7 +26,7 @@ from stages.raster.definition import (
 from stages.raster.sh import own_coefficients
 from stages.scene import TRANSPARENT
 from stages.scene.light import BRIGHT, OFFSET, POWER
-from stages.train.gauss_newton import CURVATURE_DECAY, DAMPING
+from stages.train.gauss_newton import CURVATURE_DECAY
 from stages.train.loss import SSIM_WEIGHT
 from stages.train.optimiser import (
     BETA1,
@@ -64,7 +64,7 @@ class ReferenceStep(HostStep):
             given.use_gradients(self._model, backward)
         update(
             *(self._model, backward, (settings.sh_degree + 1) ** 2, given.rates),
-            *(size[0], size[1], given.gauss_newton is not None),
+            *(size[0], size[1], self.damping(given)),
         )
         return float(value.detach())
 
@@ -119,7 +119,7 @@ def update(
     rates: LearningRates,
     width: int,
     height: int,
-    gauss_newton: bool = False,
+    damping: float = 0.0,
 ) -> None:
     """One sparse step of Adam or of `gauss_newton`, as `optimiser.apply_gradients` does it."""
     rows, g, whole = _valid(backward, rates.extent)
@@ -131,10 +131,10 @@ def update(
     m = m / (1 - BETA1**t)
     rate = np.broadcast_to(rates.row(coefficients), m.shape).astype(np.float64)
     rate[:, MEAN:ROTATION] *= model.distances[rows, None]
-    if gauss_newton:
+    if damping:
         h = model.moment2[rows, :columns].astype(np.float64)
         h[:, MEAN:ROTATION] /= rates.extent
-        shift = rate * np.clip(m / (DAMPING * h * rate + EPSILON), -1.0, 1.0)
+        shift = rate * np.clip(m / (damping * h * rate + EPSILON), -1.0, 1.0)
         shift = np.where(h > 0, shift, 0.0)
     else:
         v = BETA2 * model.moment2[rows, :columns] + (1 - BETA2) * g * g

@@ -122,6 +122,11 @@ class HostStep:
         return (*arrays[:3], logits, *arrays[4:])
 
     @staticmethod
+    def damping(given: StepInput) -> float:
+        """As the optimiser takes it: 0 for a step of Adam."""
+        return 0.0 if given.gauss_newton is None else given.gauss_newton.damping
+
+    @staticmethod
     def sign_picture(given: StepInput) -> NDArray[np.float32] | None:
         """[3, H, W] what a backward pass measures the curvature with; None if it is not measured in
         this step."""

@@ -165,7 +165,7 @@ class WebGpuStep:
             *(0.5 * view.width / view.pixels, 0.5 * view.height / view.pixels),
             *map(float, (rates.means, rates.quaternions, rates.log_scales, rates.opacity_logits)),
             *map(float, (rates.sh_dc, rates.sh_rest)),
-            int(given.gauss_newton is not None),
+            0.0 if given.gauss_newton is None else float(given.gauss_newton.damping),
         )
         buffers = (gradients, means2d, drawn.keys, drawn.lists.ends, scene.rows)
         self.gpu.run(_MOVE, -(-n // 16), (*buffers, *self._held.moments, self._held.state), numbers)
@@ -182,7 +182,7 @@ class WebGpuStep:
         """Average the squares of the derivatives into moment2."""
         buffers = (derivatives, None, drawn.keys, drawn.lists.ends, None, None)
         curvature, n = self._held.moments[1], len(self._held)
-        numbers = (*self._sizes(drawn, view, extent), *[0.0] * 8, 1)
+        numbers = (*self._sizes(drawn, view, extent), *[0.0] * 9)
         self.gpu.run(_SQUARES, -(-n // 16), (*buffers, curvature), numbers)
 
     def _sizes(

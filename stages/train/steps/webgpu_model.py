@@ -47,7 +47,7 @@ CONSTANTS: tuple[tuple[str, float], ...] = (
     *(("DEGREE_2", used_columns(4)), ("DEGREE_3", used_columns(9))),
     *((name, getattr(dropout, name)) for name in ("VIEW_SCALE", "MAX_PROBABILITY")),
     *((name, getattr(dropout, name)) for name in ("NEIGHBOURHOOD", "INVISIBLE")),
-    *((name, getattr(gauss_newton, name)) for name in ("DAMPING", "CURVATURE_DECAY")),
+    ("CURVATURE_DECAY", gauss_newton.CURVATURE_DECAY),
     *(("INCREMENT", INCREMENT), ("SHIFT_1", FACTORS[0][0]), ("FACTOR_1", FACTORS[0][1])),
     *(("SHIFT_2", FACTORS[1][0]), ("FACTOR_2", FACTORS[1][1])),
 )

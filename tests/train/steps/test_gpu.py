@@ -47,7 +47,7 @@ def test_steps_leave_what_the_definition_leaves(degree):
     plain = ReferenceStep(ReferenceRasteriser())
     plain.load(start())
     found = stepper()
-    for moves in (None, None, GaussNewton(1), GaussNewton(2), GaussNewton()):
+    for moves in (None, None, GaussNewton(300.0, 1), GaussNewton(300.0, 2), GaussNewton(300.0)):
         given = StepInput(level(), settings, RATES, gauss_newton=moves)
         losses = [s.step(given) for s in (found, plain)]
         assert losses[0] == pytest.approx(losses[1], rel=1e-5)
@@ -67,7 +67,7 @@ def test_masks_and_light_ask_what_the_definition_asks(outside, light):
     plain, found = ReferenceStep(ReferenceRasteriser()), stepper()
     plain.load(start())
     photograph = masked(outside, light)
-    given = StepInput(photograph, settings, RATES, weight=4.0, gauss_newton=GaussNewton(5))
+    given = StepInput(photograph, settings, RATES, weight=4.0, gauss_newton=GaussNewton(300.0, 5))
     losses = [s.step(given) for s in (found, plain)]
     assert losses[0] == pytest.approx(losses[1], rel=1e-5)
     for name in ("moment1", "moment2"):
@@ -102,7 +102,7 @@ def test_the_loss_and_its_gradient_are_those_of_the_definition(size):
 )
 def test_a_steady_step_never_waits_for_the_device(seen, dropout, monkeypatch):
     made = stepper(lag=2)
-    given = StepInput(seen, SETTINGS, RATES, False, dropout, gauss_newton=GaussNewton(3))
+    given = StepInput(seen, SETTINGS, RATES, False, dropout, gauss_newton=GaussNewton(300.0, 3))
     for _ in range(4):
         made.step(given)
     waits: Counter[str] = Counter()

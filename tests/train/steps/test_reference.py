@@ -63,7 +63,7 @@ def stepped(
     if keys:
         model.moment2[:] = 0.0
     for key in keys:
-        losses.append(stepper.step(replace(given, gauss_newton=GaussNewton(key))))
+        losses.append(stepper.step(replace(given, gauss_newton=GaussNewton(300.0, key))))
     return stepper.model(), losses
 
 
@@ -82,7 +82,9 @@ def test_gauss_newton_steps_are_those_of_the_definition(outside: str) -> None:
 
 def test_what_a_mask_ignores_has_no_part_in_the_curvature() -> None:
     level = masked(level_of(cloud(80, 40, 30, degree=1)), IGNORE)
-    given = StepInput(level, RasterSettings(), RATES, weight=4.0, gauss_newton=GaussNewton(1))
+    given = StepInput(
+        level, RasterSettings(), RATES, weight=4.0, gauss_newton=GaussNewton(300.0, 1)
+    )
     picture = HostStep.sign_picture(given)
     assert picture is not None
     assert level.mask is not None

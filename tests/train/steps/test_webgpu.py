@@ -44,7 +44,7 @@ def test_steps_leave_what_the_definition_leaves(degree):
         model = start()
         model.smoothing[:], model.sh_degrees[:4] = 0.02, 0
         step.load(model)
-    drops, one, other = Dropout(5, 7), GaussNewton(1), GaussNewton(2)
+    drops, one, other = Dropout(5, 7), GaussNewton(300.0, 1), GaussNewton(300.0, 2)
     for dropout, moves in ((None, None), (drops, None), (None, one), (drops, other), (None, other)):
         given = StepInput(level(), settings, RATES, True, dropout, gauss_newton=moves)
         losses = [s.step(given) for s in (found, plain)]
@@ -62,7 +62,7 @@ def test_masks_and_light_ask_what_the_definition_asks(seen):
     settings = RasterSettings(near=0.1, sh_degree=0, background=(0.2, 0.9, 0.4))
     plain, found = ReferenceStep(ReferenceRasteriser()), stepper()
     plain.load(start())
-    given = StepInput(seen, settings, RATES, weight=4.0, gauss_newton=GaussNewton(5))
+    given = StepInput(seen, settings, RATES, weight=4.0, gauss_newton=GaussNewton(300.0, 5))
     losses = [s.step(given) for s in (found, plain)]
     assert losses[0] == pytest.approx(losses[1], rel=1e-5)
     for name in ("moment1", "moment2"):

@@ -3,7 +3,7 @@
 
 struct Step {
     n: u32, columns: u32, used: u32, groups: u32, room: u32, extent: f32, ndc_x: f32, ndc_y: f32,
-    means: f32, rotation: f32, scale: f32, opacity: f32, dc: f32, rest: f32, gauss_newton: u32,
+    means: f32, rotation: f32, scale: f32, opacity: f32, dc: f32, rest: f32, damping: f32,
 }
 @group(0) @binding(0) var<uniform> p: Step;
 @group(0) @binding(1) var<storage, read> gradients: array<f32>;
@@ -76,10 +76,10 @@ fn move_splats(at_work: Place) {
         let distance = select(1.0, bitcast<f32>(state[own + DISTANCE]), k < ROTATION);
         let rate = distance * rate_of(k);
         var step = 0.0;
-        if (p.gauss_newton != 0u) {
+        if (p.damping > 0.0) {
             let h = moment2[at];
             let own_rate = select(rate, rate / p.extent, k < ROTATION);
-            let share = clamp(first / (DAMPING * h * own_rate + EPSILON), -1.0, 1.0);
+            let share = clamp(first / (p.damping * h * own_rate + EPSILON), -1.0, 1.0);
             step = select(0.0, rate * share, h > 0.0);
         } else {
             let v = BETA2 * moment2[at] + (1.0 - BETA2) * g * g;
