@@ -56,7 +56,7 @@ KERNELS: tuple[tuple[Any, dict[str, Any], dict[str, Any]], ...] = (
     (gpu_kernels.similarity_kernel, {"BLOCK": 256}, {}),
     (gpu_kernels.slope_rows_kernel, {"BLOCK": 256}, {}),
     (gpu_kernels.loss_gradient_kernel, {"BLOCK": 256}, {}),
-    *((gpu_kernels.move_kernel, {**_ROWS, "GAUSS_NEWTON": moves}, {}) for moves in (False, True)),
+    (gpu_kernels.move_kernel, {**_ROWS, "GAUSS_NEWTON": True}, {}),
     (gpu_kernels.average_squares_kernel, _ROWS, {}),
 )
 
@@ -139,6 +139,7 @@ def main(target: str) -> None:
         for degree in range(3):
             how = {"COEFFICIENTS": (degree + 1) ** 2}
             kernels[f"{kernel.__name__}, degree {degree}"] = (kernel, how, {})
+    kernels["move_kernel, Adam"] = (gpu_kernels.move_kernel, {**_ROWS, "GAUSS_NEWTON": False}, {})
     with tempfile.TemporaryDirectory() as folder:
         triton.knobs.cache.dir = folder
         for name, (kernel, constants, options) in kernels.items():
