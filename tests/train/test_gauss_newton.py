@@ -56,10 +56,10 @@ def backward(values: NDArray[np.floating]) -> Backward:
     return Backward(rows, parameters, np.zeros((len(values), 2), np.float32))
 
 
-def moved(m: Model, gradients: NDArray[np.floating], rates: LearningRates = RATES):
+def moved(m: Model, gradients: NDArray[np.floating]) -> NDArray[np.floating]:
     """[M, USED] by how much one step lowers each parameter."""
     before = np.concatenate([array.reshape(len(m), -1) for array in m.arrays], 1)
-    apply_gradients(Pool(1), m, backward(gradients), 4, rates, 100, 50, damping=DAMPED)
+    apply_gradients(Pool(1), m, backward(gradients), 4, RATES, 100, 50, damping=DAMPED)
     after = np.concatenate([array.reshape(len(m), -1) for array in m.arrays], 1)
     return (before - after)[: len(gradients)]
 

@@ -1,5 +1,4 @@
-"""A training step with the CPU kernels: forward pass, loss, backward pass and the
-optimiser's step."""
+"""A training step with the CPU kernels: forward pass, loss, backward pass, update."""
 
 from __future__ import annotations
 
@@ -40,6 +39,6 @@ class CpuStep(HostStep):
             given.use_gradients(self._model, backward)
         apply_gradients(
             *(pool, self._model, backward, (settings.sh_degree + 1) ** 2, given.rates),
-            *(level.camera.width, level.camera.height, self.damping(given)),
+            *(level.camera.width, level.camera.height, given.damping),
         )
         return loss.value

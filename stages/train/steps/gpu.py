@@ -223,8 +223,8 @@ class GpuStep:
         if given.weight != 1.0:
             v_image *= given.weight
         view_target.ignore_masked(v_image)
-        if given.gauss_newton is not None and given.gauss_newton.key is not None:
-            signs = sign_picture(v_image, given.gauss_newton.key, given.weight)
+        if given.sign_key is not None:
+            signs = sign_picture(v_image, given.sign_key, given.weight)
             view_target.ignore_masked(signs)
             derivatives, _ = self.rasteriser.gradients(scene, view, drawn, signs)
             self._measure(drawn, view, derivatives, given.rates.extent, room)
@@ -289,11 +289,11 @@ class GpuStep:
             *(active_counts(coefficients), rates.means, rates.quaternions, rates.log_scales),
             *(rates.opacity_logits, rates.sh_dc, rates.sh_rest),
             *(0.5 * view.width / pixels, 0.5 * view.height / pixels),
-            *(rates.extent, 0.0 if given.gauss_newton is None else given.gauss_newton.damping),
+            *(rates.extent, given.damping),
             COLUMNS=columns,
             WIDTH=triton.next_power_of_2(columns),
             BLOCK=block,
-            GAUSS_NEWTON=given.gauss_newton is not None,
+            GAUSS_NEWTON=given.damping > 0.0,
         )
 
     def _measure(

@@ -64,7 +64,7 @@ class ReferenceStep(HostStep):
             given.use_gradients(self._model, backward)
         update(
             *(self._model, backward, (settings.sh_degree + 1) ** 2, given.rates),
-            *(size[0], size[1], self.damping(given)),
+            *(size[0], size[1], given.damping),
         )
         return float(value.detach())
 

@@ -52,6 +52,16 @@ class StepInput:
     weight: float = 1.0
     gauss_newton: GaussNewton | None = None
 
+    @property
+    def damping(self) -> float:
+        """Of `gauss_newton`; 0 to move as Adam."""
+        return 0.0 if self.gauss_newton is None else self.gauss_newton.damping
+
+    @property
+    def sign_key(self) -> int | None:
+        """The key of `gauss_newton`: None if the curvature is not measured in this step."""
+        return None if self.gauss_newton is None else self.gauss_newton.key
+
 
 class TrainingStep(Protocol):
     """A backend's training step. It holds the model where the backend's kernels need it."""
@@ -122,16 +132,11 @@ class HostStep:
         return (*arrays[:3], logits, *arrays[4:])
 
     @staticmethod
-    def damping(given: StepInput) -> float:
-        """As the optimiser takes it: 0 for a step of Adam."""
-        return 0.0 if given.gauss_newton is None else given.gauss_newton.damping
-
-    @staticmethod
     def sign_picture(given: StepInput) -> NDArray[np.float32] | None:
         """[3, H, W] what a backward pass measures the curvature with; None if it is not measured in
         this step."""
-        if given.gauss_newton is None or given.gauss_newton.key is None:
+        if given.sign_key is None:
             return None
-        picture = sign_picture(given.level.pixels.shape, given.gauss_newton.key, given.weight)
+        picture = sign_picture(given.level.pixels.shape, given.sign_key, given.weight)
         ignore_masked(given.level, picture)
         return picture

@@ -103,8 +103,8 @@ class WebGpuStep:
         v_image = self._loss.gradient(
             drawn.image, photograph, level, settings.background, given.weight
         )
-        if given.gauss_newton is not None and given.gauss_newton.key is not None:
-            signs = self._signs(photograph, level, given.gauss_newton.key, given.weight)
+        if given.sign_key is not None:
+            signs = self._signs(photograph, level, given.sign_key, given.weight)
             derivatives, _ = self.rasteriser.gradients(scene, view, drawn, signs)
             self._measure(drawn, view, given.rates.extent, derivatives)
         gradients, means2d = self.rasteriser.gradients(scene, view, drawn, v_image)
@@ -165,7 +165,7 @@ class WebGpuStep:
             *(0.5 * view.width / view.pixels, 0.5 * view.height / view.pixels),
             *map(float, (rates.means, rates.quaternions, rates.log_scales, rates.opacity_logits)),
             *map(float, (rates.sh_dc, rates.sh_rest)),
-            0.0 if given.gauss_newton is None else float(given.gauss_newton.damping),
+            float(given.damping),
         )
         buffers = (gradients, means2d, drawn.keys, drawn.lists.ends, scene.rows)
         self.gpu.run(_MOVE, -(-n // 16), (*buffers, *self._held.moments, self._held.state), numbers)
