@@ -12,6 +12,7 @@ from stages.base.text import counted, listed
 from stages.evaluate.verdict import GOOD, UNKNOWN, USABLE, WRONG
 from stages.run.manifest import Manifest
 from stages.run.pipeline import Pipeline
+from stages.train.settings import PRESETS
 
 # The metrics in the tables of `process` and `status`, by stage; those of `show_quality` apart.
 _HEADLINES = {
@@ -27,6 +28,10 @@ _HEADLINES = {
 _SMALLER = {"mean at half size": "psnr_half_db", "mean at quarter size": "psnr_quarter_db"}
 _SCALE = """To an eye: 20 dB is blurred, 25 dB is softer, 30 dB is close to the photograph.
 More of PSNR and SSIM: docs/guide/captures.md#psnr-and-ssim"""
+# With so few views more steps for each fit these photographs and no others
+# (docs/experiments/densification.md#longer-and-shorter-runs).
+_FEW_VIEWS, _ENOUGH_STEPS = 25, PRESETS["standard"].steps_per_view
+_MORE_STEPS = "With so few views\nmore steps give less than 0.1 dB in the mean. "
 _STYLES = {GOOD: "green", USABLE: "yellow", WRONG: "red", UNKNOWN: ""}
 
 
@@ -117,11 +122,13 @@ def show_choice(manifest: Manifest) -> None:
     given = any(settings.get(name) for name in ("steps", "seconds", "splats"))
     if manifest.stage != "train" or given or "splat_cap" not in metrics:
         return
-    views = counted(metrics["training_views"], "training view")
+    views = metrics["training_views"]
+    enough = metrics["steps"] >= _ENOUGH_STEPS * views and views <= _FEW_VIEWS
     console.out.print(
-        f"\nChosen for {views}: {metrics['steps']:,} steps at {metrics['side_px']} px,\n"
-        f"and {metrics['splats']:,} of at most {metrics['splat_cap']:,} splats. What more would "
-        "give:\ndocs/guide/presets.md#what-more-would-give-in-your-scene",
+        f"\nChosen for {counted(views, 'training view')}: {metrics['steps']:,} steps at "
+        f"{metrics['side_px']} px,\nand {metrics['splats']:,} of at most "
+        f"{metrics['splat_cap']:,} splats. {_MORE_STEPS if enough else ''}What more would give:\n"
+        "docs/guide/presets.md#what-more-would-give-in-your-scene",
         markup=False,
     )
 

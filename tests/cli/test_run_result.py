@@ -23,6 +23,8 @@ def shown(
     capsys: pytest.CaptureFixture[str],
     verdict: dict[str, str],
     settings: dict[str, Any] | None = None,
+    views: int = 21,
+    steps: int = 3150,
 ) -> str:
     """The output for a run of `sfm` and `train`, this with `settings`."""
     metrics: dict[str, Any] = {
@@ -42,7 +44,7 @@ def shown(
         for name, values in metrics.items()
     }
     metrics["train"] |= {"psnr_db": 27.107, "psnr_half_db": 27.494, "ssim": 0.8776}
-    metrics["train"] |= {"training_views": 21, "steps": 3150, "side_px": 640}
+    metrics["train"] |= {"training_views": views, "steps": steps, "side_px": 640}
     metrics["train"] |= {"splats": 113_229, "splat_cap": 147_000}
     metrics["train"] |= {"psnr_worst_db": 23.116, "psnr_worst_view": "IMG_0017.jpg"}
     pipeline: Any = SimpleNamespace(
@@ -107,6 +109,18 @@ def test_what_the_training_views_decided_is_said(
     chosen = "Chosen for 21 training views: 3,150 steps at 640 px,\nand 113,229 of at most 147,000"
     assert chosen in shown(capsys, good)
     assert "Chosen" not in shown(capsys, good, given)
+
+
+@pytest.mark.parametrize(
+    ("views", "steps", "said"), [(21, 3150, True), (21, 2000, False), (60, 9000, False)]
+)
+def test_more_steps_are_said_to_give_little_only_with_few_views_and_enough_steps_for_each(
+    capsys: pytest.CaptureFixture[str], views: int, steps: int, said: bool
+) -> None:
+    good = {"grade": "good", "text": "Good."}
+    words = " ".join(shown(capsys, good, views=views, steps=steps).split())
+    assert ("more steps give less than 0.1 dB in the mean" in words) == said
+    assert "What more would give: docs/guide/presets.md#what-more" in words
 
 
 def test_quiet_runs_tell_only_of_a_wrong_result(
