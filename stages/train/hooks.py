@@ -91,6 +91,7 @@ class Transients:
             drawn = rendering_of(rasteriser.forward(arrays, level.camera, settings, depths=True))
             compared.append(Comparison.of(level, drawn, settings.background))
         trainer.transient = transient_parts(compared)
+        trainer.stepper.forget_views()
 
 
 @dataclass(frozen=True)
@@ -148,7 +149,7 @@ class Curvature:
         if schedule.densifying(step) or not schedule.densifying(step - 1):
             return
         model = trainer.model
-        model.moment2 = np.zeros(model.moment2.shape, np.float32)
+        model.reset_moment2()
         trainer.replace_model(model)
 
 

@@ -354,6 +354,9 @@ class Model:
         self.gradient_sum[:] = 0.0
         self.gradient_count[:] = 0
 
+    def reset_moment2(self) -> None:
+        self.moment2[:] = 0.0
+
     # A model on a device computes what follows there (`steps.device_model`).
 
     def on_host(self) -> Model:

@@ -20,6 +20,7 @@ from stages.raster.definition import (
     used_columns,
 )
 from stages.raster.kernels.pool import Pool
+from stages.raster.webgpu import device
 from stages.scene import DrawSettings
 from stages.train.gauss_newton import CURVATURE_DECAY, INTERVAL, sign_picture
 from stages.train.hooks import Curvature
@@ -208,12 +209,14 @@ def test_it_moves_once_densification_has_ended_and_measures_in_one_of_so_many_st
     assert keys == [k.key for k in map(schedule.gauss_newton, range(500, 1000)) if k and k.key]
 
 
-@pytest.mark.parametrize("backend", ["cpu", "gpu"])
+@pytest.mark.parametrize("backend", ["cpu", "gpu", "webgpu"])
 def test_adams_second_moment_is_forgotten_when_densification_ends(
     backend: str, tmp_path: Path
 ) -> None:
     if backend == "gpu":
         pytest.importorskip("triton")
+    if backend == "webgpu" and (why := device.missing()):
+        pytest.skip(why)
     start = cloud(20, 24, 16, degree=0, seed=2)
     picture = np.random.default_rng(0).random((16, 24, 3)).astype(np.float32)
     schedule = Schedule(steps=40, extent=1.0, sh_degree=0, n_start=20, seed=0)

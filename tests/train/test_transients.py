@@ -118,6 +118,14 @@ def test_nothing_is_decided_before_the_run_draws_at_full_size(tmp_path):
     assert transient(trainer(tmp_path, photographs(with_figure)), 5) == []
 
 
+def test_the_step_forgets_views_once_parts_of_them_are_ignored(tmp_path, monkeypatch):
+    made = trainer(tmp_path, photographs(with_figure))
+    calls = []
+    monkeypatch.setattr(made.stepper, "forget_views", lambda: calls.append(len(made.transient)))
+    transient(made)
+    assert calls == [7]
+
+
 def test_a_cut_out_photograph_is_not_masked_further():
     pixels = np.full((30, 40, 3), 90, np.uint8)
     mask = np.full((30, 40), 255, np.uint8)

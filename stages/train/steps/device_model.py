@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from stages.raster.gpu.rasteriser import DeviceScene, GpuRasteriser  # loads Triton
 
 FIELDS = tuple(field.name for field in fields(Model))
+# what can be given in place of what is held; `Held.gathered` takes no other
+GIVEN = frozenset(FIELDS) - {"sh", "moment1", "moment2"}
 PLACES: dict[str, slice | int] = {
     "means": slice(MEAN, ROTATION),
     "quaternions": slice(ROTATION, LOG_SCALE),
@@ -52,6 +54,9 @@ class Held(Protocol):
 
     def finite(self) -> Tensor:
         """[N] bool: see `Model.finite`."""
+
+    def reset_moment2(self) -> None:
+        """Set the second moment of every row to 0."""
 
     def gathered(self, model: DeviceModel) -> Held:
         """The numbers of the model's rows alone."""
@@ -90,6 +95,10 @@ class TensorsHeld:
     def finite(self) -> Tensor:
         """See `Held`."""
         return self.scene.rows.isfinite().all(1)
+
+    def reset_moment2(self) -> None:
+        """See `Held`."""
+        self.others["moment2"].zero_()
 
     def gathered(self, model: DeviceModel) -> TensorsHeld:
         """See `Held`."""
@@ -155,6 +164,8 @@ class DeviceModel(Model):
         return found
 
     def __setattr__(self, name: str, value: Any) -> None:
+        if name not in GIVEN:
+            raise AttributeError(f"{name} of a model on a device cannot be replaced")
         self.given[name] = torch.as_tensor(value, device=self.held.device)
         vars(self).pop(name, None)
 
@@ -226,6 +237,12 @@ class DeviceModel(Model):
         """See `Model.reset_gradients`."""
         for name in ("gradient_sum", "gradient_count"):
             setattr(self, name, torch.zeros_like(self.column(name)))
+
+    def reset_moment2(self) -> None:
+        """See `Model.reset_moment2`. In place, because a second copy may not fit: models of other
+        rows of the same step change, too."""
+        self.held.reset_moment2()
+        vars(self).pop("moment2", None)
 
     def finite(self) -> NDArray[np.bool_]:
         """See `Model.finite`."""

@@ -199,6 +199,10 @@ class GpuStep:
         """See `step.TrainingStep`."""
         return DeviceModel(self._held) if self._on_host is None else self._on_host
 
+    def forget_views(self) -> None:
+        """See `step.TrainingStep`."""
+        self._targets.clear()
+
     def step(self, given: StepInput) -> float:
         """See `step.TrainingStep`; the loss is that of LAG steps ago."""
         value, wanted = self._with_memory(lambda: self._step(given))

@@ -49,6 +49,10 @@ class MemoryLimitedStep:
         """See `step.TrainingStep`."""
         return self.inner.model()
 
+    def forget_views(self) -> None:
+        """See `step.TrainingStep`."""
+        self.inner.forget_views()
+
     def step(self, given: StepInput) -> float:
         """See `step.TrainingStep`."""
         return self._done(lambda: self.inner.step(given))

@@ -81,6 +81,9 @@ class TrainingStep(Protocol):
     def model(self) -> Model:
         """The current model, on the host; good until the next step."""
 
+    def forget_views(self) -> None:
+        """Forget the training views, because parts of them are ignored from now on."""
+
     def step(self, given: StepInput) -> float:
         """Forward pass, loss, backward pass and one step of Adam or of `gauss_newton`.
 
@@ -117,6 +120,9 @@ class HostStep:
 
     def model(self) -> Model:
         return self._model
+
+    def forget_views(self) -> None:
+        """See `TrainingStep`; a step on the host keeps none."""
 
     def draw(self, camera: Camera, settings: RasterSettings, smooth: bool) -> NDArray[np.float32]:
         forward = self.rasteriser.forward(self._model.drawn(smooth), camera, settings)

@@ -75,6 +75,10 @@ class WebGpuStep:
         """See `step.TrainingStep`."""
         return DeviceModel(self._held) if self._on_host is None else self._on_host
 
+    def forget_views(self) -> None:
+        """See `step.TrainingStep`."""
+        self._photographs.clear()
+
     def step(self, given: StepInput) -> float:
         """See `step.TrainingStep`; the loss is that of LAG steps ago."""
         try:

@@ -106,6 +106,11 @@ class WebGpuHeld:
         """See `device_model.Held`."""
         return self.column("rows").isfinite().all(1)
 
+    def reset_moment2(self) -> None:
+        """See `device_model.Held`."""
+        self.gpu.clear(self.moments[1], len(self) * self.scene.columns)
+        self._read.pop("moment2", None)
+
     def gathered(self, model: DeviceModel) -> WebGpuHeld:
         """See `device_model.Held`."""
         gpu, n, columns = self.gpu, len(model), self.scene.columns

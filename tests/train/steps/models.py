@@ -66,6 +66,13 @@ def floaters_removed(space, model: Model) -> Model:
 
 
 ADAPTIVE = AdaptiveDensity(12)
+
+
+def curvature_forgotten(model: Model) -> Model:
+    model.reset_moment2()
+    return model.take(np.arange(len(model) - 1))
+
+
 EVENTS: dict[str, Callable[[Model], Model]] = {
     "densification": partial(densified, ADAPTIVE),
     "in a part": partial(densified, BoundedDensity(ADAPTIVE, (-1.0, 0.0, 1.0, 4.0))),
@@ -73,5 +80,6 @@ EVENTS: dict[str, Callable[[Model], Model]] = {
         floaters_removed, known_free_space(3 * cloud(300, 40, 30, seed=9).means, cameras(3))
     ),
     "fewest": partial(most_opaque, cap=100),
+    "curvature": curvature_forgotten,
     "twice": lambda model: densified(ADAPTIVE, densified(ADAPTIVE, model)),
 }

@@ -218,6 +218,19 @@ def test_a_full_device_loses_photographs_and_not_splats(monkeypatch):
 
 
 @pytest.mark.slow
+def test_a_forgotten_view_is_ignored_where_it_has_become_masked():
+    plain = level()
+    now = replace(plain, mask=masked(IGNORE, None).mask, outside=IGNORE)
+    wanted, found = stepper(), stepper()
+    found.step(StepInput(plain, SETTINGS, RATES))
+    found.load(start())
+    found.forget_views()
+    assert found.step(StepInput(now, SETTINGS, RATES)) == wanted.step(
+        StepInput(now, SETTINGS, RATES)
+    )
+
+
+@pytest.mark.slow
 def test_a_picture_that_does_not_fit_is_said_to_be_too_many_splats(monkeypatch):
     made = stepper()
     monkeypatch.setattr(made.rasteriser, "draw", full)

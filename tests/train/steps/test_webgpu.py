@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -170,6 +170,18 @@ def test_more_than_a_buffer_holds_is_said_to_be_too_many_splats(monkeypatch):
     monkeypatch.setattr(made.gpu, "empty", refused)
     with pytest.raises(MemoryFull):
         made.load(start())
+
+
+def test_a_forgotten_view_is_ignored_where_it_has_become_masked():
+    plain = level()
+    now = replace(plain, mask=masked(IGNORE, None).mask, outside=IGNORE)
+    wanted, found = stepper(), stepper()
+    found.step(StepInput(plain, SETTINGS, RATES))
+    found.load(start())
+    found.forget_views()
+    assert found.step(StepInput(now, SETTINGS, RATES)) == wanted.step(
+        StepInput(now, SETTINGS, RATES)
+    )
 
 
 def test_photographs_make_room_where_memory_is_full(monkeypatch):
