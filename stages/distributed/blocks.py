@@ -39,6 +39,7 @@ from stages.scene import (
     split_held_out,
     training_extent,
 )
+from stages.train import transients
 from stages.train.build import corrects_light
 from stages.train.dropout import uses_dropout
 from stages.train.finetune import FineTuner
@@ -113,6 +114,9 @@ class _BlockTraining:
         assigned = partition.assign_views(fractions)
         folders = self._blocks(seeds, coarse, cells, assigned, partition.margin(points))
         parts = self._parts(folders, cells, assigned)
+        steps, masks = self._course(folders, folder)
+        self.whole = self.whole.with_masks(masks)
+        training, held = split_held_out(self.whole.views)
         draw_settings = draw_settings_of(
             self.whole, self.settings.train_side, light, self.settings.antialias
         )
@@ -122,8 +126,7 @@ class _BlockTraining:
         trained = self._merge(parts, cells, seam_views, draw_settings, len(training))
         verdict = self._evaluate(trained.splats, held, folder)
         wrong = verdict.grade == WRONG and self.whole.contradicted
-        steps = max(self._trained(name).steps for name in {*folders})
-        trained = replace(trained, contradicted=wrong, steps=steps)
+        trained = replace(trained, contradicted=wrong, steps=steps, masks=masks)
         save(folder, trained)
         self.report.metric("training_views", len(training))
         self.report.metric("held_out_views", len(held))
@@ -211,6 +214,26 @@ class _BlockTraining:
             )
         self.report.metric("blocks", facts)
         return parts
+
+    def _course(self, folders: Sequence[str], folder: Path) -> tuple[int, dict[str, Path]]:
+        """(the steps of the longest training of a block; the masks of what moved, which are written
+        to `folder`). The coarse model's are of smaller pictures, so they are left out."""
+        steps, found = 0, []
+        for name in sorted({*folders}):  # one at a time, as in `_parts`
+            block = self._trained(name)
+            steps = max(steps, block.steps)
+            if name != COARSE:
+                found.append(block.masks)
+        shutil.rmtree(folder / transients.FOLDER, ignore_errors=True)
+        masks = transients.join_masks(folder, found)
+        if masks:
+            self.report.warn(
+                "train-transients",
+                f"Something moved in {counted(len(masks), 'photograph')}: training ignored the "
+                "parts that other photographs do not confirm, see "
+                f"{FOLDER}/*/4-train/transients.png.",
+            )
+        return steps, masks
 
     def _own(
         self, splats: Splats, cell: Cell, most: int, views: Sequence[View]

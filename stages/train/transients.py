@@ -14,7 +14,7 @@ instead.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -139,11 +139,34 @@ def save_masks(
     files = {}
     for number, (name, level, transient) in enumerate(zip(names, levels, parts, strict=True)):
         if level.mask is not None and level.outside == IGNORE and transient.any():
-            files[name] = folder / FOLDER / f"{number:04d}.png"
-            files[name].parent.mkdir(exist_ok=True)
-            with replacing(files[name]) as temporary:
-                Image.fromarray(level.mask).save(temporary, format="PNG")
+            files[name] = _write_mask(folder, number, level.mask)
     return files
+
+
+def join_masks(folder: Path, found: Iterable[Mapping[str, Path]]) -> dict[str, Path]:
+    """Write masks of the same photographs, by name, into `folder`, each as one: what all of them
+    keep. Masks of a photograph have one size. Raises OSError if the disk is full."""
+    by_name: dict[str, list[Path]] = {}
+    for masks in found:
+        for name, path in masks.items():
+            by_name.setdefault(name, []).append(path)
+    return {
+        name: _write_mask(folder, number, np.minimum.reduce([_read_mask(path) for path in paths]))
+        for number, (name, paths) in enumerate(sorted(by_name.items()))
+    }
+
+
+def _write_mask(folder: Path, number: int, mask: NDArray[np.uint8]) -> Path:
+    path = folder / FOLDER / f"{number:04d}.png"
+    path.parent.mkdir(exist_ok=True)
+    with replacing(path) as temporary:
+        Image.fromarray(mask).save(temporary, format="PNG")
+    return path
+
+
+def _read_mask(path: Path) -> NDArray[np.uint8]:
+    with Image.open(path) as picture:
+        return np.asarray(picture.convert("L"))
 
 
 def _seen_by_others(view: Comparison, views: Sequence[Comparison]) -> dict[int, NDArray[np.intp]]:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from splatcli.distribution import distributed
 from stages.base.errors import Interrupted, SplatError
@@ -20,7 +21,7 @@ from stages.run.pipeline import Pipeline
 from stages.run.stages import STAGE_NAMES, STAGE_OF
 from stages.scene import save_splats, split_held_out
 from stages.sfm.reconstruction_files import save_reconstruction
-from stages.train import build
+from stages.train import build, hooks
 from tests.small_scene import small_scene
 
 pytestmark = pytest.mark.timeout(300)  # the first to train compiles kernels
@@ -113,6 +114,27 @@ def test_blocks_come_near_to_the_scene_in_one(tmp_path, photos) -> None:
     assert whole is not None
     assert parts is not None
     assert parts.metrics["psnr_db"] > whole.metrics["psnr_db"] - 1.0
+
+
+def test_what_moved_in_a_block_is_ignored_by_what_follows(tmp_path, photos, monkeypatch) -> None:
+    def first_corner(views):
+        parts = [np.zeros((3, 4), bool) for _ in views]
+        parts[0][0, 0] = True
+        return parts
+
+    monkeypatch.setattr(hooks, "transient_parts", first_corner)
+    pipeline = trained(tmp_path / "run", photos, blocks="2", steps=20)
+    runs = [Pipeline(tmp_path / "run" / "blocks" / name) for name in ("1", "2")]
+    found = [(name, mask) for run in runs for name, mask in run.load("train").masks.items()]
+    masks = pipeline.load("train").masks
+    assert found
+    assert {*masks} == {name for name, _ in found}
+    for name, mask in found:
+        joined, own = (np.asarray(Image.open(path)) for path in (masks[name], mask))
+        assert ((joined == 0) | (own > 0)).all()
+    manifest = pipeline.manifest("train")
+    assert manifest is not None
+    assert "train-transients" in {code for code, *_ in manifest.warnings}
 
 
 class Impatient(Listener):

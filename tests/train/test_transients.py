@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from stages.base.stage import Report
 from stages.raster.draw import render
@@ -22,7 +23,7 @@ from stages.train.checkpoint import load_checkpoint
 from stages.train.conversion import model_of
 from stages.train.hooks import Transients
 from stages.train.schedule import HALF_SIZE_END, Schedule
-from stages.train.transients import PARTS, save_masks, without
+from stages.train.transients import PARTS, join_masks, save_masks, without
 from stages.train.views import Level
 from tests.scenes import camera, splats
 from tests.train.pictures import trainer_of, view_of
@@ -174,6 +175,21 @@ def test_later_stages_ignore_the_same_parts(tmp_path):
         assert (mask is None) == (level.mask is None)
         if mask is not None:
             np.testing.assert_array_equal(mask, level.mask)
+
+
+def test_masks_of_a_photograph_in_several_blocks_keep_what_all_keep(tmp_path):
+    def saved(folder, **masks):
+        (tmp_path / folder).mkdir()
+        for name, mask in masks.items():
+            Image.fromarray(np.array(mask, np.uint8)).save(tmp_path / folder / f"{name}.png")
+        return {name: tmp_path / folder / f"{name}.png" for name in masks}
+
+    found = [saved("1", a=[[0, 255]], b=[[255, 0]]), saved("2", b=[[0, 255]]), {}]
+    joined = join_masks(tmp_path, found)
+    assert {name: np.asarray(Image.open(path)).tolist() for name, path in joined.items()} == {
+        "a": [[0, 255]],
+        "b": [[0, 0]],
+    }
 
 
 def test_ignored_parts_do_not_move_a_splat(tmp_path):
