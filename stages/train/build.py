@@ -47,8 +47,9 @@ def make_trainer(
     light = corrects_light(reconstruction, settings.light, report)
     train = load_views(reconstruction.folder, kept, settings.train_side, folder, light)
     given = settings.splats is not None
-    most_steps = _most_steps(settings, len(train))
-    if not settings.steps and not given:
+    most_steps = max(settings.steps, _most_steps(settings, len(train)))
+    trains = settings.steps > 0 or not given
+    if trains and (settings.seconds or not settings.steps):  # a time limit plans fewer
         settings = replace(settings, steps=most_steps)
     antialias = start.draw_settings.antialias if given else settings.antialias
     sh_degree = max(settings.sh_degree if settings.steps else 0, start.sh_degree)
@@ -71,7 +72,7 @@ def make_trainer(
         any_background=settings.background == "any",
         backend=backend,
         seconds=settings.seconds and max(settings.seconds - (time.monotonic() - began), 1.0),
-        most_steps=max(settings.steps, most_steps),
+        most_steps=most_steps,
         within=settings.within,
     )
     schedule = Schedule(

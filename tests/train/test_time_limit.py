@@ -98,6 +98,14 @@ def test_a_given_number_of_steps_is_made(tmp_path):
     assert steps_of(tmp_path / "b", 5, steps=300, steps_per_view=1_000) == (300, 4_000)
 
 
+def test_however_long_the_limit_a_run_makes_the_steps_that_its_photographs_are_worth(tmp_path):
+    """A run that would end before its first plan is made is no shorter than one with a plan."""
+    for steps in (10, 300):
+        limited = {"steps": steps, "seconds": 36_000.0, "steps_per_view": 1_000}
+        assert steps_of(tmp_path / f"{steps}", 5, **limited) == (4_000, 4_000)
+    assert steps_of(tmp_path / "more", 5, steps=9_000, seconds=60.0)[0] == 9_000
+
+
 def test_steps_that_take_a_second_each_still_end_in_time():
     took, _ = simulated(60.0, lambda share: 1.0)
     assert 30 < took < 66
