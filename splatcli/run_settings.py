@@ -22,7 +22,7 @@ DEFAULT_PRESET = "standard"
 # Options that describe one capture: a batch gives the same options to all of its runs.
 _OF_ONE_CAPTURE = (
     *("masks", "depth", "cameras", "split", "refine_cameras"),
-    *("scale", "blocks", "view"),
+    *("scale", "metres", "splats", "densify", "blocks", "view"),
 )
 
 

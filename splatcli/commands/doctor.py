@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import math
 import os
 import platform
 import shutil
@@ -30,7 +31,7 @@ _LITTLE_MEMORY_MIB = 2048.0
 _LITTLE_DISK_BYTES = 2_000_000_000
 _BACKEND_ADVICE = "docs/guide/{page}.md says what it takes."
 # CPU minutes of a whole run of the sample, 24 photographs of 640 px, with AVX-512; see README.
-_CPU_MINUTES = {"preview": 3.0, "standard": 11.0}
+_CPU_MINUTES = {"preview": 3.0, "standard": 5.0}
 _WITHOUT_AVX512 = 2.0
 _VIDEO_CODECS = ("h264", "hevc", "av1", "vp9", "vp8", "mpeg4", "prores", "mjpeg", "gif")
 
@@ -137,7 +138,7 @@ def _meaning() -> str:
         return f"uses {chosen.name} ({chosen.describe()})"
     slower = 1.0 if _has_avx512() else _WITHOUT_AVX512
     takes = (
-        f"about {max(1, round(slower * minutes / threads.count()))} min at `{preset}`"
+        f"about {math.ceil(slower * minutes / threads.count())} min at `{preset}`"
         for preset, minutes in _CPU_MINUTES.items()
     )
     return f"uses the CPU, no GPU: 24 photographs of 640 px take {', '.join(takes)}, a whole run"

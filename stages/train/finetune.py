@@ -1,6 +1,6 @@
 """Continues the training of given splats on given views, with small learning rates.
 
-This is the only way to train splats that already exist: `prune` fine-tunes after rounds that a
+`prune` fine-tunes after rounds that a
 target needs, `quantise` fine-tunes to plain drawing and to what file formats round, and blocks of a
 large scene are fine-tuned where they meet. The number of splats never changes.
 """

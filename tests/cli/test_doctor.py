@@ -42,7 +42,7 @@ def test_a_library_that_is_missing_or_broken_is_named(monkeypatch: pytest.Monkey
     assert CliRunner().invoke(app, ["doctor"]).exit_code == 6
 
 
-@pytest.mark.parametrize(("avx512", "minutes"), [(True, (2, 6)), (False, (3, 11))])
+@pytest.mark.parametrize(("avx512", "minutes"), [(True, (2, 3)), (False, (3, 5))])
 def test_it_ends_with_what_it_means_for_a_run(
     avx512: bool, minutes: tuple[int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
