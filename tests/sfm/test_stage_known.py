@@ -200,6 +200,21 @@ def test_the_test_photographs_of_a_split_are_held_out_and_give_no_points(tmp_pat
     assert len(without.views) == 6
 
 
+@pytest.mark.parametrize("training", [0, 1])
+def test_a_split_that_leaves_next_to_nothing_for_training_is_refused(
+    tmp_path: Path, training: int
+) -> None:
+    path = tmp_path / "transforms.json"
+    names = split_file(path)
+    data = json.loads(path.read_text())
+    data |= {"train_filenames": names[5 - training :], "test_filenames": names[: 5 - training]}
+    path.write_text(json.dumps(data))
+    with pytest.raises(SplatError) as caught:
+        reconstructed(tmp_path / "sfm", path, 5, split=True, allow_partial=True)
+    assert caught.value.code == "sfm-too-few-photographs"
+    assert f"{training} photograph" in caught.value.given
+
+
 def test_photographs_without_cameras_are_named(tmp_path: Path) -> None:
     cameras = model(tmp_path / "cameras", lambda pose: pose, 4)
     with pytest.raises(SplatError) as caught:

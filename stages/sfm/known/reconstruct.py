@@ -324,6 +324,16 @@ def _check_usable(posed: Sequence[PosedPhoto], refine: bool) -> None:
             wanted="At least 3.",
             hint="Check that the file's names are those of the photographs.",
         )
+    training = sum(one.role != "test" for one in posed)
+    if training < 2:
+        raise SplatError(
+            "sfm-too-few-photographs",
+            given=f"{counted(training, 'photograph')} of {len(posed)} with a camera "
+            f"{'is' if training == 1 else 'are'} for training, by the split of the camera file.",
+            wanted="At least 2.",
+            hint="Add photographs for training, or leave --split away; then every eighth is held "
+            "out.",
+        )
     if refine and any(one.role == "test" for one in posed):
         raise UsageError(
             "cameras-split-and-refined",
