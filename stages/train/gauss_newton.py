@@ -11,7 +11,8 @@ its entries is the diagonal h (Hutchinson 1989). The step of a parameter with th
 where m is Adam's first moment and h an average over measurements, which takes the place of Adam's
 second moment in `Model.moment2`. This is a diagonal trust region, as in Sophia (Liu et al. 2023,
 2305.14342) and 3DGS2-TR (2602.00395). EPSILON, Adam's own, keeps rounding noise from moving what
-hardly shows. A parameter whose h is not known yet does not move.
+hardly shows. A parameter whose h is not known yet does not move, so h is measured in every step
+until each training view has been drawn once.
 
 The damping is more than 1 because splats that overlap move together, and because the slope of an
 absolute error r is that of a squared one with the curvature 1 / r.
@@ -32,7 +33,7 @@ CURVATURE_DECAY = 0.95  # of the average, each time that a splat is measured
 # x the learning rate of opacities: where one is near 0 or 1, slope and curvature both vanish, and a
 # step is as large as the rate. With the whole rate, noise makes splats transparent for good.
 OPACITY_RATE = 0.1
-INTERVAL = 4  # steps from one measurement to the next, which costs a backward pass
+INTERVAL = 4  # steps from one measurement to the next later, which costs a backward pass
 
 
 @dataclass(frozen=True)

@@ -150,12 +150,15 @@ class Schedule:
         red, green, blue = np.random.default_rng([self.seed, 3, step]).random(3)
         return float(red), float(green), float(blue)
 
-    def gauss_newton(self, step: int) -> GaussNewton | None:
-        """How `step` moves: None while the model is densified."""
+    def gauss_newton(self, step: int, n_views: int) -> GaussNewton | None:
+        """How `step` moves: None while the model is densified. The curvature is measured in each
+        step until each of `n_views` training views has been drawn once, then in one of INTERVAL."""
         if self.densifying(step):
             return None
         damping = DAMPING / self.raised(RATES_POWER)
-        if step % INTERVAL:
+        since = self.share(step) - max(DENSIFICATION_END, self.share(0))
+        measured = since / (self.share(step + 1) - self.share(step)) + 1e-6
+        if step % INTERVAL and measured >= n_views:
             return GaussNewton(damping)
         key = int(np.random.default_rng([self.seed, 5, step]).integers(1 << 32))
         return GaussNewton(damping, key)

@@ -165,7 +165,7 @@ class Trainer:
         dropout = None
         if self.task.dropout and not schedule.densifying(step):  # it distorts mean gradients
             dropout = Dropout(len(self.task.views), schedule.dropout_key(step))
-        weight, moves = schedule.weight(step), schedule.gauss_newton(step)
+        weight, moves = schedule.weight(step), schedule.gauss_newton(step, len(self.task.views))
         given = StepInput(level, settings, rates, smooth, dropout, refine, weight, moves)
         return self.stepper.step(given)
 

@@ -34,7 +34,7 @@ from stages.train.optimiser import (
     new_model,
 )
 from stages.train.random_bits import hashed, signs
-from stages.train.schedule import DENSIFICATION_END, Schedule
+from stages.train.schedule import DENSIFICATION_END, DENSIFYING_PART, LAST_PART, Schedule
 from tests.scenes import camera, cloud
 from tests.train.pictures import trainer_of, view_of
 
@@ -198,15 +198,46 @@ def test_it_settles_where_the_slope_is_zero_however_steep_the_parameters_are() -
     np.testing.assert_allclose(now, wanted, atol=DAMPED * 2.4e-7)
 
 
-def test_it_moves_once_densification_has_ended_and_measures_in_one_of_so_many_steps() -> None:
+VIEWS = 20
+
+
+def measures_in(schedule: Schedule, first: int) -> list[bool]:
+    """Whether each step from `first` on measures. All move by the curvature."""
+    kinds = [schedule.gauss_newton(step, VIEWS) for step in range(first, schedule.steps)]
+    assert None not in kinds
+    keys = [kind.key for kind in kinds if kind is not None and kind.key is not None]
+    assert len(keys) == len(set(keys))
+    return [kind is not None and kind.key is not None for kind in kinds]
+
+
+def test_it_moves_once_densification_has_ended() -> None:
     schedule = Schedule(steps=1000, extent=1.0, sh_degree=1, n_start=10, seed=3)
-    kinds = [schedule.gauss_newton(step) for step in range(1000)]
-    assert {kind is None for kind in kinds[:500]} == {True}
-    later = [kind for kind in kinds[500:] if kind is not None]
-    keys = [kind.key for kind in later if kind.key is not None]
-    assert len(later) == 500
-    assert len(keys) == len(set(keys)) == 500 // INTERVAL
-    assert keys == [k.key for k in map(schedule.gauss_newton, range(500, 1000)) if k and k.key]
+    assert {schedule.gauss_newton(step, VIEWS) for step in range(500)} == {None}
+    assert measures_in(schedule, 500) == measures_in(schedule, 500)
+
+
+@pytest.mark.parametrize("since", [(0, 0.0), DENSIFYING_PART, LAST_PART])
+def test_it_measures_each_view_once_in_a_row_and_then_one_step_in_so_many(
+    since: tuple[int, float],
+) -> None:
+    schedule = Schedule(1000, extent=1.0, sh_degree=1, n_start=10, seed=3, since=since)
+    first = next(step for step in range(1000) if not schedule.densifying(step))
+    found = measures_in(schedule, first)
+    assert all(found[:VIEWS])
+    assert abs(sum(found[VIEWS:]) - (1000 - first - VIEWS) / INTERVAL) <= 1
+
+
+def test_a_plan_that_is_changed_later_measures_no_view_anew() -> None:
+    schedule = Schedule(steps=1000, extent=1.0, sh_degree=1, n_start=10, seed=3)
+    for steps in (900, 1500):
+        found = measures_in(schedule.replanned(700, steps), 700)
+        assert abs(sum(found) - (steps - 700) / INTERVAL) <= 1
+
+
+def test_a_run_of_few_steps_measures_in_each() -> None:
+    for steps in (2, 3, 10):
+        schedule = Schedule(steps, extent=1.0, sh_degree=0, n_start=10, seed=0)
+        assert all(measures_in(schedule, steps - steps // 2))
 
 
 @pytest.mark.parametrize("backend", ["cpu", "gpu", "webgpu"])
