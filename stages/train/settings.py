@@ -148,7 +148,7 @@ PRESETS: dict[str, TrainSettings] = {
 
 STAGE = Stage(
     "train",
-    version=44,
+    version=45,
     reads=("sfm", "seed"),
     settings_type=TrainSettings,
     **in_module("stages.train.stage"),
