@@ -12,7 +12,7 @@ from stages.base.text import counted, listed
 from stages.evaluate.verdict import GOOD, UNKNOWN, USABLE, WRONG
 from stages.run.manifest import Manifest
 from stages.run.pipeline import Pipeline
-from stages.train.settings import PRESETS
+from stages.train.settings import STEPS_PER_VIEW
 
 # The metrics in the tables of `process` and `status`, by stage; those of `show_quality` apart.
 _HEADLINES = {
@@ -30,7 +30,7 @@ _SCALE = """To an eye: 20 dB is blurred, 25 dB is softer, 30 dB is close to the 
 More of PSNR and SSIM: docs/guide/captures.md#psnr-and-ssim"""
 # With so few views more steps for each fit these photographs and no others
 # (docs/experiments/densification.md#longer-and-shorter-runs).
-_FEW_VIEWS, _ENOUGH_STEPS = 25, PRESETS["standard"].steps_per_view
+_FEW_VIEWS = 25
 _MORE_STEPS = "With so few views\nmore steps give less than 0.1 dB in the mean. "
 _STYLES = {GOOD: "green", USABLE: "yellow", WRONG: "red", UNKNOWN: ""}
 
@@ -123,7 +123,7 @@ def show_choice(manifest: Manifest) -> None:
     if manifest.stage != "train" or given or "splat_cap" not in metrics:
         return
     views = metrics["training_views"]
-    enough = metrics["steps"] >= _ENOUGH_STEPS * views and views <= _FEW_VIEWS
+    enough = metrics["steps"] >= STEPS_PER_VIEW * views and views <= _FEW_VIEWS
     console.out.print(
         f"\nChosen for {counted(views, 'training view')}: {metrics['steps']:,} steps at "
         f"{metrics['side_px']} px,\nand {metrics['splats']:,} of at most "

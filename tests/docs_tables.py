@@ -191,20 +191,6 @@ def backends() -> str:
     return _table(("`--backend`", "is"), rows)
 
 
-def presets() -> str:
-    from stages.train.settings import PRESETS
-
-    rows: list[tuple[str, ...]] = []
-    for name, preset in PRESETS.items():
-        cap = f"{preset.max_splats:,}" if preset.max_splats else "by memory and photographs"
-        if preset.splats_per_view:
-            cap += f", and {preset.splats_per_view:,} a view"
-        size = f"{preset.train_side} px"
-        steps = f"{preset.steps:,}" if preset.steps else f"{preset.steps_per_view} a view"
-        rows.append((f"`{name}`", steps, size, str(preset.sh_degree), cap))
-    return _table(("`--preset`", "steps", "size", "SH degree", "splats, at most"), rows)
-
-
 def operations() -> str:
     from stages.editing.syntax import OPERATIONS
 
@@ -241,7 +227,6 @@ TABLES: dict[str, Callable[[], str]] = {
     "format-modules": format_modules,
     "cameras": cameras,
     "backends": backends,
-    "presets": presets,
     "operations": operations,
     "commands": commands,
     "errors": errors,

@@ -14,7 +14,7 @@ from splatcli.app import ENTRIES, loaded
 from stages.base.distribution import VERSION
 from stages.formats.format_table import TABLE
 from stages.run.stages import STAGE_NAMES
-from stages.train.settings import PRESETS
+from stages.train.settings import PRESETS, STEPS_PER_VIEW, STEPS_PER_VIEW_SQUARED
 from tests.docs_commands import bash_lines, inline_commands, splat_commands
 from tests.docs_picture import EVERYWHERE, PICTURE, Drawing, imports, reached_from
 from tests.docs_tables import PAGES, ROOT, renewed
@@ -89,8 +89,11 @@ def test_presets_are_those_of_the_code(page: str) -> None:
     text = (ROOT / page).read_text(encoding="utf-8").replace(",", "")
     for name, preset in PRESETS.items():
         (row,) = [line for line in text.splitlines() if re.match(rf"\| `{name}`.*steps.* at", line)]
-        views = f"{preset.steps_per_view} steps a training view"
-        steps = f"{preset.steps} steps" if preset.steps else views
+        steps = f"{preset.steps} steps"
+        if not preset.steps:
+            steps = f"{preset.steps_per_view or STEPS_PER_VIEW} steps a training view"
+        if not preset.steps and not preset.steps_per_view:
+            steps += f" ({STEPS_PER_VIEW_SQUARED} times their number if more)"
         assert f"{steps} at {preset.train_side} px" in row
 
 

@@ -40,7 +40,7 @@ from stages.scene import (
     training_extent,
 )
 from stages.train import transients
-from stages.train.build import corrects_light
+from stages.train.build import corrects_light, most_steps_for
 from stages.train.dropout import uses_dropout
 from stages.train.finetune import FineTuner
 from stages.train.history import History
@@ -142,10 +142,11 @@ class _BlockTraining:
         return report_verdict(splats, views, self.whole, self.settings.backend, self.report)
 
     def _coarse(self, seeds: Splats, fewer: int) -> Splats:
+        views = len(split_held_out(self.whole.views)[0])
+        steps = self.settings.steps or most_steps_for(self.settings.steps_per_view, views)
         settings = replace(
             self.settings,
-            steps=-(-self.settings.steps // COARSE_STEPS),
-            steps_per_view=-(-self.settings.steps_per_view // COARSE_STEPS),
+            steps=-(-steps // COARSE_STEPS),
             train_side=max(16, self.settings.train_side // COARSE_SIDE),
             max_splats=max(1, self.settings.max_splats // fewer),
             splats_per_view=0,

@@ -23,7 +23,7 @@ from stages.scene.light import spread_ev
 from stages.train.camera_refinement import CameraRefinement
 from stages.train.cap import Cap, cap_for, splats_determined
 from stages.train.schedule import DENSIFYING_PART, LAST_PART, PUBLISHED_STEPS, Schedule
-from stages.train.settings import TrainSettings
+from stages.train.settings import STEPS_PER_VIEW, STEPS_PER_VIEW_SQUARED, TrainSettings
 from stages.train.trainer import Trainer, TrainingTask
 from stages.train.views import load_views
 
@@ -47,7 +47,7 @@ def make_trainer(
     light = corrects_light(reconstruction, settings.light, report)
     train = load_views(reconstruction.folder, kept, settings.train_side, folder, light)
     given = settings.splats is not None
-    most_steps = max(settings.steps, _most_steps(settings, len(train)))
+    most_steps = max(settings.steps, most_steps_for(settings.steps_per_view, len(train)))
     trains = settings.steps > 0 or not given
     if trains and (settings.seconds or not settings.steps):  # a time limit plans fewer
         settings = replace(settings, steps=most_steps)
@@ -136,9 +136,10 @@ def _warn_of_small_photographs(
         )
 
 
-def _most_steps(settings: TrainSettings, views: int) -> int:
-    """How many steps so many training views are worth."""
-    return min(max(LEAST_STEPS, settings.steps_per_view * views), PUBLISHED_STEPS)
+def most_steps_for(steps_per_view: int, views: int) -> int:
+    """How many steps so many training views are worth. steps_per_view: see `TrainSettings`."""
+    each = steps_per_view or max(STEPS_PER_VIEW, STEPS_PER_VIEW_SQUARED * views)
+    return min(max(LEAST_STEPS, each * views), PUBLISHED_STEPS)
 
 
 def _on_the_host(backend: str, report: Report) -> str:

@@ -13,6 +13,10 @@ from stages.formats.format_table import PLAIN
 from stages.formats.output_formats import drawing_setting
 from stages.raster.backends import backend_setting
 
+# More fit few photographs alone; with many, steps gain the longer the more views there are
+# (docs/experiments/densification.md#steps-for-each-training-view).
+STEPS_PER_VIEW, STEPS_PER_VIEW_SQUARED = 150, 7
+
 
 @dataclass(frozen=True)
 class TrainSettings:
@@ -25,11 +29,12 @@ class TrainSettings:
         max=1_000_000,
     )
     steps_per_view: int = setting(
-        150,
+        STEPS_PER_VIEW,
         "Training steps for each training view where --steps does not give their number, and at "
-        "most where --seconds does.",
+        f"most where --seconds does. 0: {STEPS_PER_VIEW}, or {STEPS_PER_VIEW_SQUARED} times the "
+        "number of training views if that is more.",
         panel="Advanced",
-        min=1,
+        min=0,
         max=1_000_000,
     )
     train_side: int = setting(
@@ -137,13 +142,12 @@ class TrainSettings:
 PRESETS: dict[str, TrainSettings] = {
     "preview": TrainSettings(steps=2400, train_side=480, sh_degree=1, max_splats=60_000),
     "standard": TrainSettings(
-        steps_per_view=150,
         train_side=800,
         sh_degree=2,
         max_splats=250_000,
         splats_per_view=7_000,
     ),
-    "best": TrainSettings(steps_per_view=800, train_side=1600, sh_degree=3),
+    "best": TrainSettings(steps_per_view=0, train_side=1600, sh_degree=3),
 }
 
 STAGE = Stage(

@@ -5,7 +5,7 @@ import pytest
 
 from stages.base.stage import Report
 from stages.scene import DrawSettings
-from stages.train.build import LEAST_STEPS, make_trainer
+from stages.train.build import LEAST_STEPS, make_trainer, most_steps_for
 from stages.train.conversion import model_of
 from stages.train.density import AdaptiveDensity, gradient_threshold
 from stages.train.hooks import Densification, step_hooks
@@ -17,7 +17,7 @@ from stages.train.schedule import (
     SCALES,
     Schedule,
 )
-from stages.train.settings import TrainSettings
+from stages.train.settings import PRESETS, TrainSettings
 from stages.train.time_limit import TimeLimit
 from tests.scenes import camera, cloud
 from tests.small_scene import small_scene
@@ -85,6 +85,15 @@ def test_each_training_view_takes_its_steps(tmp_path):
     assert steps_of(tmp_path / "a", 5, steps_per_view=1_000) == (4_000,) * 2
     assert steps_of(tmp_path / "b", 5, steps_per_view=10_000) == (PUBLISHED_STEPS,) * 2
     assert steps_of(tmp_path / "c", 5, steps_per_view=100) == (LEAST_STEPS,) * 2
+
+
+@pytest.mark.parametrize(
+    ("views", "steps"), [(3, 2_000), (16, 2_400), (21, 3_150), (30, 6_300), (66, 30_000)]
+)
+def test_best_makes_more_steps_for_each_view_the_more_views_there_are(views, steps):
+    """And never fewer than `standard`."""
+    presets = [most_steps_for(PRESETS[name].steps_per_view, views) for name in ("standard", "best")]
+    assert presets[1] == steps >= presets[0]
 
 
 def test_more_photographs_never_take_fewer_steps(tmp_path):
