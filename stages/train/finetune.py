@@ -1,8 +1,8 @@
 """Continues the training of given splats on given views, with small learning rates.
 
-`prune` fine-tunes after rounds that a
-target needs, `quantise` fine-tunes to plain drawing and to what file formats round, and blocks of a
-large scene are fine-tuned where they meet. The number of splats never changes.
+`prune` fine-tunes after rounds that a target needs, `quantise` fine-tunes to plain drawing and to
+what file formats round, and blocks of a large scene are fine-tuned where they meet. The number of
+splats never changes.
 """
 
 from __future__ import annotations

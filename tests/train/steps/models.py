@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
-from stages.raster.definition import splat_arrays
+from stages.raster.definition import RasterSettings, splat_arrays
+from stages.scene import IGNORE
 from stages.train.cap import most_opaque
 from stages.train.density import AdaptiveDensity, BoundedDensity, cull
 from stages.train.free_space import known_free_space
 from stages.train.loss import channel_means
-from stages.train.optimiser import Model, new_model
+from stages.train.optimiser import LearningRates, Model, new_model
+from stages.train.steps.step import StepInput, TrainingStep
 from stages.train.views import Level
 from tests.scenes import camera, cloud
 
@@ -32,6 +35,17 @@ def start(n=20) -> Model:
     found = new_model(*(a.copy() for a in splat_arrays(cloud(n, 40, 30, degree=1, seed=4))))
     found.distances[:] = np.linspace(0.1, 5.0, n)
     return found
+
+
+def losses_where_masked_later(known: TrainingStep, fresh: TrainingStep) -> tuple[float, float]:
+    """Of a view that has become masked: of a step that knew it whole and forgot it, and of one that
+    never saw it."""
+    plain, settings, rates = level(), RasterSettings(near=0.1, sh_degree=1), LearningRates()
+    now = replace(plain, mask=masked(IGNORE, None).mask, outside=IGNORE)
+    known.step(StepInput(plain, settings, rates))
+    known.load(start())
+    known.forget_views()
+    return known.step(StepInput(now, settings, rates)), fresh.step(StepInput(now, settings, rates))
 
 
 def used_model(n: int = 300, degree: int = 1) -> Model:

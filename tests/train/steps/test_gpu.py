@@ -26,7 +26,7 @@ from stages.train.steps.reference import ReferenceStep, reference_loss
 from stages.train.steps.step import StepInput
 from tests.scenes import camera
 from tests.tolerances import LOSS_GRADIENT
-from tests.train.steps.models import level, masked, start
+from tests.train.steps.models import level, losses_where_masked_later, masked, start
 
 pytestmark = pytest.mark.gpu
 RATES = LearningRates(means=1e-3)
@@ -219,15 +219,8 @@ def test_a_full_device_loses_photographs_and_not_splats(monkeypatch):
 
 @pytest.mark.slow
 def test_a_forgotten_view_is_ignored_where_it_has_become_masked():
-    plain = level()
-    now = replace(plain, mask=masked(IGNORE, None).mask, outside=IGNORE)
-    wanted, found = stepper(), stepper()
-    found.step(StepInput(plain, SETTINGS, RATES))
-    found.load(start())
-    found.forget_views()
-    assert found.step(StepInput(now, SETTINGS, RATES)) == wanted.step(
-        StepInput(now, SETTINGS, RATES)
-    )
+    found, wanted = losses_where_masked_later(stepper(), stepper())
+    assert found == wanted
 
 
 @pytest.mark.slow

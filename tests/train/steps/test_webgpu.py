@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,14 @@ from stages.train.steps.reference import ReferenceStep
 from stages.train.steps.step import StepInput
 from stages.train.steps.webgpu import WebGpuStep
 from tests.scenes import camera
-from tests.train.steps.models import EVENTS, level, masked, start, used_model
+from tests.train.steps.models import (
+    EVENTS,
+    level,
+    losses_where_masked_later,
+    masked,
+    start,
+    used_model,
+)
 
 pytestmark = pytest.mark.skipif(bool(device.missing()), reason=device.missing())
 RATES = LearningRates(means=1e-3, extent=2.0)
@@ -173,15 +180,8 @@ def test_more_than_a_buffer_holds_is_said_to_be_too_many_splats(monkeypatch):
 
 
 def test_a_forgotten_view_is_ignored_where_it_has_become_masked():
-    plain = level()
-    now = replace(plain, mask=masked(IGNORE, None).mask, outside=IGNORE)
-    wanted, found = stepper(), stepper()
-    found.step(StepInput(plain, SETTINGS, RATES))
-    found.load(start())
-    found.forget_views()
-    assert found.step(StepInput(now, SETTINGS, RATES)) == wanted.step(
-        StepInput(now, SETTINGS, RATES)
-    )
+    found, wanted = losses_where_masked_later(stepper(), stepper())
+    assert found == wanted
 
 
 def test_photographs_make_room_where_memory_is_full(monkeypatch):
