@@ -68,7 +68,8 @@ def recorded_for(folder: Path, photos: Path | None, first_stage_folder: Path) ->
     moved = recorded.photographs is not None and not recorded.photographs.exists()
     if recorded.photographs is not None and not moved and recorded.photographs.samefile(photos):
         return recorded  # through a link, or with `..` in its path
-    if has_finished_work(folder) and not moved and not _same(photos, first_stage_folder):
+    accepted = _shares_any if moved else _same
+    if has_finished_work(folder) and not accepted(photos, first_stage_folder):
         before = recorded.photographs or "other photographs"
         raise RunFolderError(
             "run-folder-other-photographs",
@@ -84,6 +85,14 @@ def _same(photos: Path, first_stage_folder: Path) -> bool:
     if done is None:
         return False
     return combined_digest(record_files(photos, users=True)) == done.inputs.get(PHOTOS)
+
+
+def _shares_any(photos: Path, first_stage_folder: Path) -> bool:
+    """Whether a file is one of those that the run was made from, or these are not known."""
+    done = Manifest.read(first_stage_folder)
+    known = {} if done is None else done.input_files.get(PHOTOS, {})
+    now = {record.sha256 for record in record_files(photos, users=True).values()}
+    return not known or bool(now & {record.sha256 for record in known.values()})
 
 
 def check_photos(folder: Path, photos: Path) -> None:

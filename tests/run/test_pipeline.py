@@ -460,6 +460,26 @@ def test_other_photographs_are_refused(finished: Pipeline, run_folder: Path, tmp
     assert caught.value.code == "run-folder-other-photographs"
 
 
+def test_other_photographs_are_refused_while_those_of_the_run_are_away(
+    finished: Pipeline, photos: Path, run_folder: Path, tmp_path: Path
+) -> None:
+    """They may be on a card that is unplugged."""
+    shutil.move(photos, photos.with_name("card"))
+    with pytest.raises(SplatError) as caught:
+        Pipeline(run_folder, photographs(tmp_path / "other", z="zzz"), fake_stages()).run()
+    assert caught.value.code == "run-folder-other-photographs"
+    assert ran(Pipeline(run_folder, photos.with_name("card"), fake_stages())) == []
+
+
+def test_moved_photographs_may_have_become_more(
+    finished: Pipeline, photos: Path, run_folder: Path
+) -> None:
+    moved = photos.with_name("archive")
+    shutil.move(photos, moved)
+    (moved / "c.jpg").write_text("x")
+    assert "copy" in ran(Pipeline(run_folder, moved, fake_stages()))
+
+
 def test_other_photographs_may_follow_those_of_which_nothing_came(
     photos: Path, run_folder: Path, tmp_path: Path
 ) -> None:
