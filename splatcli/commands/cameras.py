@@ -34,6 +34,7 @@ def cameras(
     to_nerfstudio = _is_json(out)
     source = _model_of_run(source) if runfolder.is_run_folder(source) else source
     model = colmap.locate(source)
+    _check_other(out, source if model is None else model)
     if model is None:
         found, cloud, observations = read_cameras(source), NO_POINTS, colmap.NO_OBSERVATIONS
     else:
@@ -88,6 +89,18 @@ def _is_json(out: Path) -> bool:
         wanted="A name that ends in .json for nerfstudio, or a folder's for COLMAP.",
         hint="For example transforms.json, or sparse",
     )
+
+
+def _check_other(out: Path, source: Path) -> None:
+    """Raise SplatError where cameras would be written onto those that are read: what only the
+    source holds, as its roles and units, would be lost."""
+    if out.exists() and source.exists() and out.samefile(source):
+        raise UsageError(
+            "target-is-source",
+            given=f"{out} is what is read.",
+            wanted="Another name.",
+            hint=f"For example {out.with_name('new-' + out.name)}",
+        )
 
 
 def _model_of_run(run: Path) -> Path:

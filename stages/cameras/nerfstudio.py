@@ -59,7 +59,7 @@ def write(
     points: NDArray[np.float64] | None = None,
     colours: NDArray[np.uint8] | None = None,
 ) -> None:
-    """Write the views. The points go into a .ply of the same name beside the file: nerfstudio
+    """Write the views. The points go into NAME_points.ply beside NAME.json: nerfstudio
     initialises splats from it. Raises SplatError if a file cannot be written.
 
     Args:
@@ -79,7 +79,7 @@ def write(
     if shared:
         data |= lenses[0]
     if points is not None and colours is not None and len(points):
-        beside = path.with_suffix(".ply")
+        beside = path.with_name(f"{path.stem}_points.ply")  # X.ply may hold the splats of X.json
         _write_points(beside, points @ APPLIED_TRANSFORM.T, colours)
         data["ply_file_path"] = beside.name
     data["frames"] = [

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from plyfile import PlyData
 
 from stages.cameras import colmap
 from stages.cameras.camera_formats import read_cameras
@@ -43,6 +44,26 @@ def test_colmap_to_nerfstudio_and_back(splat, tmp_path: Path) -> None:
     assert set(before) == set(after)
     for name, pose in before.items():
         np.testing.assert_allclose(after[name], pose, atol=1e-12)
+
+
+def test_splats_of_the_same_name_stay(splat, tmp_path: Path) -> None:
+    project(tmp_path / "project")
+    Path("scene.ply").write_text("splats")
+    assert splat("cameras", "project", "scene.json").exit_code == 0
+    assert Path("scene.ply").read_text() == "splats"
+    points = json.loads(Path("scene.json").read_text(encoding="utf-8"))["ply_file_path"]
+    assert len(PlyData.read(points)["vertex"].data) == 30
+
+
+@pytest.mark.parametrize("target", ["cameras.json", "project/sparse/0"])
+def test_cameras_are_not_written_onto_their_source(splat, tmp_path: Path, target: str) -> None:
+    project(tmp_path / "project")
+    splat("cameras", "project", "cameras.json")
+    before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
+    result = splat("cameras", target, target)
+    assert result.exit_code == 2
+    assert "target-is-source" in result.stderr
+    assert {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == before
 
 
 def test_colmap_keeps_its_points(splat, tmp_path: Path) -> None:

@@ -83,7 +83,7 @@ def _points(text: bool) -> bytes:
         model = example()
         views = [View(n, n, c) for n, c in zip(model.names, model.cameras, strict=True)]
         nerfstudio.write(path, views, path.parent, model.cloud.points, model.cloud.colours)
-        data = PlyData.read(str(path.with_suffix(".ply")))
+        data = PlyData.read(str(path.with_name(f"{path.stem}_points.ply")))
         data.text = text
         out = io.BytesIO()
         data.write(out)
