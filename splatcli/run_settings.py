@@ -75,12 +75,15 @@ def _view_parameter() -> Parameter:
     return options.keyword("view", bool, option, default=False)
 
 
-def _shown(setting: Setting) -> str | bool:
-    """The default for the help; "by preset" for a training setting whose value differs between
-    presets."""
+def _by_preset(setting: Setting) -> bool:
+    """Whether it is a training setting whose value differs between presets."""
     values = {getattr(preset, setting.name, setting.default) for preset in PRESETS.values()}
-    by_preset = len(values) > 1 and setting in settings_of(type(PRESETS[DEFAULT_PRESET]))
-    return "by preset" if by_preset else options.shown_default(setting)
+    return len(values) > 1 and setting in settings_of(type(PRESETS[DEFAULT_PRESET]))
+
+
+def _shown(setting: Setting) -> str | bool:
+    """The default for the help."""
+    return "by preset" if _by_preset(setting) else options.shown_default(setting)
 
 
 def _shown_or_recorded(setting: Setting) -> str | bool:
@@ -115,7 +118,7 @@ def combined(
     """
     chosen = dict(base)
     if preset is not None and "train" in chosen:
-        chosen["train"] = replace(PRESETS[preset], splats=chosen["train"].splats)
+        chosen["train"] = _with_preset(chosen["train"], preset)
     if given.get("splats") not in (None, UNSET) and "steps" not in given:
         given = {**given, "steps": 0}
     if "train" in chosen:
@@ -129,6 +132,14 @@ def combined(
         for name in {settings.backend for settings in with_backend}:
             backend_of(name).require()
     return new
+
+
+def _with_preset(train: TrainSettings, preset: str) -> TrainSettings:
+    """`train` with the amount of training of a preset, without a time limit; all else stays."""
+    names = {one.name for one in settings_of(TrainSettings) if _by_preset(one)}
+    if train.splats is not None:
+        names.discard("steps")  # a preset's would not train given splats
+    return replace(train, seconds=0.0, **{name: getattr(PRESETS[preset], name) for name in names})
 
 
 def of_new_run(given: Mapping[str, Any]) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from pathlib import Path
 
 import pytest
 
@@ -56,3 +57,21 @@ def test_a_number_of_splats_that_is_given_holds_for_any_number_of_photographs(pr
     assert (given.max_splats, given.splats_per_view) == (400_000, 0)
     both = {"preset": preset, "max_splats": 400_000, "splats_per_view": 500}
     assert run_settings.of_new_run(both)["train"].splats_per_view == 500
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_preset_changes_what_presets_decide_and_nothing_else(preset: str) -> None:
+    given = {"drawing": "plain", "background": "any", "seed": 7, "backend": "cpu", "smooth": True}
+    begun = run_settings.of_new_run({**given, "seconds": 60.0})
+    settings = run_settings.combined(begun, {}, preset)
+    for name, value in given.items():
+        holders = [stage for stage in settings.values() if hasattr(stage, name)]
+        assert {getattr(stage, name) for stage in holders} == {value}
+    train, own = settings["train"], PRESETS[preset]
+    amount = ("steps", "steps_per_view", "train_side", "sh_degree", "max_splats", "seconds")
+    assert [getattr(train, name) for name in amount] == [getattr(own, name) for name in amount]
+
+
+def test_a_preset_leaves_the_steps_of_given_splats() -> None:
+    begun = run_settings.of_new_run({"splats": Path("other.ply"), "steps": 3000})
+    assert run_settings.combined(begun, {}, "best")["train"].steps == 3000
