@@ -10,7 +10,8 @@ from stages.base.atomic import rename
 from stages.base.errors import RunFolderError
 from stages.run.failures import unusable
 from stages.run.manifest import MANIFEST, Manifest
-from stages.run.runfile import RUN_FILE
+from stages.run.runfile import RUN_FILE, RunFile
+from stages.run.runfolder import check_outside
 
 
 def branch(source: Path, target: Path) -> None:
@@ -21,7 +22,10 @@ def branch(source: Path, target: Path) -> None:
     they affect. Raises SplatError "run-folder-foreign" if `target` holds anything, and
     "run-folder-unusable" or one for a full disk.
     """
-    if target.exists() and any(target.iterdir()):
+    recorded = RunFile.read(source)
+    if recorded is not None and recorded.photographs is not None:
+        check_outside(target, recorded.photographs)
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise RunFolderError(
             "run-folder-foreign",
             given=f"{target} exists and holds other things.",
@@ -40,8 +44,9 @@ def branch(source: Path, target: Path) -> None:
             target.rmdir()
         rename(half, target)
     except OSError as error:
-        shutil.rmtree(half, ignore_errors=True)
         raise unusable(error, target) from error
+    finally:
+        shutil.rmtree(half, ignore_errors=True)
 
 
 def _copy(folder: Path, target: Path) -> None:

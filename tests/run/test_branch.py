@@ -56,6 +56,30 @@ def test_a_file_of_the_users_own_is_copied(run: Path, tmp_path: Path) -> None:
     assert (tmp_path / "second" / "2-count" / "notes.txt").read_text() == "mine"
 
 
+def test_a_run_among_the_photographs_is_refused(run: Path, tmp_path: Path) -> None:
+    """Ingest would read its pictures."""
+    with pytest.raises(SplatError) as caught:
+        branch(run, tmp_path / "photos" / "second")
+    assert caught.value.code == "run-folder-inside-photographs"
+    assert not (tmp_path / "photos" / "second").exists()
+
+
+def test_a_file_in_the_place_of_the_new_run_is_refused_and_stays(run: Path, tmp_path: Path) -> None:
+    target = tmp_path / "notes"
+    target.write_text("mine")
+    with pytest.raises(SplatError) as caught:
+        branch(run, target)
+    assert caught.value.code == "run-folder-foreign"
+    assert target.read_text() == "mine"
+
+
+def test_a_damaged_run_leaves_no_half_of_the_new_one(run: Path, tmp_path: Path) -> None:
+    (run / "1-copy" / "manifest.json").write_text("{")
+    with pytest.raises(SplatError):
+        branch(run, tmp_path / "second")
+    assert {path.name for path in tmp_path.iterdir()} == {"photos", "run"}
+
+
 def test_a_folder_with_other_things_is_refused_and_stays(run: Path, tmp_path: Path) -> None:
     target = tmp_path / "album"
     target.mkdir()
