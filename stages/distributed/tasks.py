@@ -9,7 +9,7 @@ import logging
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Event
 from typing import Any, Protocol
@@ -20,6 +20,7 @@ from stages.distributed.remote import Location, local_copies
 from stages.run.failures import as_splat_error
 from stages.run.listener import Listener, Listeners
 from stages.run.pipeline import Pipeline
+from stages.run.stages import SHARED_OPTIONS
 from stages.train.cap import needed_mib
 
 _log = logging.getLogger(__name__)
@@ -48,7 +49,12 @@ class RunTask:
         with local_copies(self.run_folder, self.photos) as (run_folder, photos, upload):
             listeners = Listeners(upload, listener or Listener())
             pipeline = Pipeline(run_folder, photos)
-            pipeline.run(self.settings, until=self.until, listener=listeners)
+            formats = {  # files that were exported stay
+                name: replace(given, formats=pipeline.with_exported(given.formats))
+                for name, given in self.settings.items()
+                if name in SHARED_OPTIONS["formats"]
+            }
+            pipeline.run({**self.settings, **formats}, until=self.until, listener=listeners)
 
 
 def task_for(run_folder: Location, photos: Location, settings: Mapping[str, Any]) -> RunTask:

@@ -57,6 +57,13 @@ def test_what_is_finished_is_not_done_again(splat, captures) -> None:
     assert set(rows()) == set(NAMES)
 
 
+def test_formats_that_were_exported_stay(splat, captures) -> None:
+    splat("batch", captures[0], "--format", "splat")
+    assert splat("batch", captures[0], "--format", "ply").exit_code == 0
+    made = json.loads(Path("runs/hill/7-export/manifest.json").read_text())
+    assert set(made["settings"]["formats"]) == {"splat", "ply"}
+
+
 def test_a_capture_that_fails_does_not_keep_the_others(splat, captures, pretend) -> None:
     blurred = SplatError("ingest-blurred", given="All blurred.", wanted="Sharp.", hint="Again.")
     pretend["ingest"] = failing_at("room", blurred)
