@@ -179,10 +179,14 @@ def check_settings(settings: Any) -> None:
 
 
 def changed(settings: Any, typed: Mapping[str, Any]) -> Any:
-    """`settings` with the typed values of its fields, checked. Raises as `check_settings`."""
+    """`settings` with the typed values of its fields, checked. What is taken back takes back what
+    means nothing without it. Raises as `check_settings`."""
     defaults = {field.name: field.default for field in fields(settings)}
-    values = {name: value for name, value in typed.items() if name in defaults}
-    values |= {name: defaults[name] for name, value in values.items() if value is UNSET}
+    gone = {name for name, value in typed.items() if value is UNSET}
+    dependent = (one.name for one in settings_of(type(settings)) if one.needs in gone)
+    gone |= set(dependent) - typed.keys()
+    values = {name: typed[name] for name in typed.keys() & defaults.keys()}
+    values |= {name: defaults[name] for name in gone & defaults.keys()}
     new = replace(settings, **values)
     check_settings(new)
     return new

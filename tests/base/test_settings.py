@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from stages.base.errors import SplatError
-from stages.base.settings import Setting, check_settings, setting, settings_of
+from stages.base.settings import UNSET, Setting, changed, check_settings, setting, settings_of
 from stages.run.stages import STAGE_NAMES, STAGE_OF
 
 EVERY = {
@@ -83,6 +83,13 @@ def test_what_means_nothing_without_another_is_refused_alone() -> None:
         check_settings(Settings(louder=True))
     assert caught.value.code == "option-alone"
     check_settings(Settings(loud=True, louder=True))
+
+
+def test_what_is_taken_back_takes_back_what_means_nothing_without_it() -> None:
+    both = Settings(loud=True, louder=True)
+    assert changed(both, {"loud": UNSET}) == Settings()
+    with pytest.raises(SplatError, match="--louder means nothing without --loud"):
+        changed(both, {"loud": UNSET, "louder": True})
 
 
 def test_what_may_be_none_or_whole_may() -> None:
