@@ -4,7 +4,7 @@ use; `splat process` does the same with a progress bar."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from threading import Event
@@ -13,18 +13,18 @@ from typing import Any, TypedDict, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.settings import changed
+from splatcli import run_settings
+from stages.base.settings import UNSET, Setting, settings_of
 from stages.base.stage import Numbers, Stage
-from stages.formats.output_formats import DEFAULT_FORMATS
 from stages.raster.definition import Rendering
 from stages.raster.draw import render
 from stages.run import results, runfolder
 from stages.run.listener import Listener
 from stages.run.manifest import json_value
 from stages.run.pipeline import Pipeline
-from stages.run.stages import STAGE_NAMES, STAGE_OF, options_of
+from stages.run.stages import STAGE_NAMES, STAGES
 from stages.scene import Camera, ExportedAssets, Reconstruction, Splats
-from stages.train.settings import PRESETS, TrainSettings
+from stages.train.settings import PRESETS
 from stages.viewer.sinks import eight_bits
 
 
@@ -138,7 +138,7 @@ class _Calling(Listener):
 def process(
     photos: str | PathLike[str],
     run_folder: str | PathLike[str],
-    preset: str = "standard",
+    preset: str | None = None,
     *,
     progress: Callable[[Progress], None] | None = None,
     cancel: Event | None = None,
@@ -148,30 +148,39 @@ def process(
 
     Args:
         photos: folder of photographs, or a video.
-        run_folder: made if missing; continued if it is a run of the same photographs.
-        preset: "preview", "standard" or "best".
+        run_folder: made if missing; continued if it is a run of the same photographs. Options that
+            are not given then keep the values that it records.
+        preset: "preview", "standard" or "best"; None: as recorded, or "standard" for a new run.
         progress: called with each step of the work, in the thread that does it.
         cancel: once it is set, the work stops at the next safe place. Signals are left as they are.
-        options: `SHARED_OPTIONS` says which stages get a field that several have. `formats` are
-            written beside those that the run has exported.
+        options: `SHARED_OPTIONS` says which stages get a field that several have. Paths may be
+            texts; None takes one back. `formats` are written beside those that the run has
+            exported.
 
     Raises SplatError as `splat process` reports it, Interrupted after `cancel`, TypeError for an
     unknown option, ValueError for an unknown preset.
     """
-    if preset not in PRESETS:
+    from splatcli.distribution import distributed  # loads training
+
+    if preset not in (None, *PRESETS):
         raise ValueError(f"preset {preset!r}: one of {', '.join(PRESETS)} is wanted")
-    settings: dict[str, Any] = {name: STAGE_OF[name].settings_type() for name in STAGE_NAMES}
-    settings["train"] = PRESETS[preset]
-    known = {field.name for found in settings.values() for field in fields(found)}
-    if unknown := options.keys() - known:
+    known = {one.name: one for stage in STAGES for one in settings_of(stage.settings_type)}
+    if unknown := options.keys() - known.keys():
         raise TypeError(f"no stage has the option {', '.join(sorted(unknown))}")
-    pipeline = Pipeline(Path(run_folder), Path(photos))
-    options["formats"] = pipeline.with_exported(options.get("formats", DEFAULT_FORMATS))
-    given = TrainSettings.completed(options)
-    settings = {name: changed(found, options_of(name, given)) for name, found in settings.items()}
+    given = {name: _as_typed(known[name], value) for name, value in options.items()}
+    pipeline = distributed(Pipeline(Path(run_folder), Path(photos)))
+    settings = run_settings.requested(pipeline, given, preset)
     listener = _Calling(progress) if progress else None
     pipeline.run(settings, listener=listener, stop=cancel or Event())
     return open_run(run_folder)
+
+
+def _as_typed(setting: Setting, value: Any) -> Any:
+    """The value of an option as the command has it."""
+    if value is None and setting.optional:
+        return UNSET
+    is_path = setting.kind is Path and isinstance(value, (str, PathLike))
+    return Path(value).absolute() if is_path else value
 
 
 def open_run(run_folder: str | PathLike[str]) -> Scene:

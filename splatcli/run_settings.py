@@ -5,16 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from inspect import Parameter
+from pathlib import Path
 from typing import Any
 
 import typer
 
 from splatcli import console, options
+from splatcli.input_files import check_files
+from stages.base.errors import UsageError
 from stages.base.settings import UNSET, Setting, changed, settings_of
 from stages.raster.backends import backend_of
 from stages.run.pipeline import Pipeline
 from stages.run.runfolder import is_run_folder
 from stages.run.stages import STAGE_NAMES, STAGE_OF, options_of
+from stages.seed.settings import SPLATS_OF_A_STAGE
 from stages.train.settings import PRESETS, TrainSettings
 
 DEFAULT_PRESET = "standard"
@@ -106,6 +110,22 @@ def recorded(pipeline: Pipeline) -> dict[str, Any]:
     return pipeline.recorded_settings(defaults())
 
 
+def requested(pipeline: Pipeline, given: Mapping[str, Any], preset: str | None) -> dict[str, Any]:
+    """Settings by stage name of a whole run: the recorded ones, changed by a preset, then by the
+    given options. A run folder as splats stands for those that it trained. Raises SplatError, also
+    for known cameras and given splats that no run could use."""
+    given = dict(given)
+    if "formats" in given:
+        given["formats"] = pipeline.with_exported(given["formats"])
+    splats = given.get("splats", UNSET)
+    if splats is not UNSET and is_run_folder(splats):
+        given["splats"] = _trained_splats(splats, pipeline.run_folder)
+    settings = combined(recorded(pipeline), given, preset)
+    if given.keys() & {"cameras", "splats"}:
+        check_files(settings)
+    return settings
+
+
 def combined(
     base: Mapping[str, Any], given: Mapping[str, Any], preset: str | None
 ) -> dict[str, Any]:
@@ -132,6 +152,21 @@ def combined(
         for name in {settings.backend for settings in with_backend}:
             backend_of(name).require()
     return new
+
+
+def _trained_splats(run: Path, run_folder: Path) -> Path:
+    """The splats of the finished training of `run`, for `run_folder` to start from. Raises
+    SplatError."""
+    if run.resolve() == run_folder.resolve():
+        raise UsageError(
+            "option-out",
+            given=f"{run} would start from its own splats, and training replaces them.",
+            wanted="A folder of its own for the run that goes on from them.",
+            hint=f"splat process {run} --out NEW --splats {run} --steps 3000",
+        )
+    earlier = Pipeline(run)
+    earlier.load("train")  # raises if it has not finished, or is damaged
+    return earlier.stage_folder("train") / SPLATS_OF_A_STAGE
 
 
 def _with_preset(train: TrainSettings, preset: str) -> TrainSettings:

@@ -9,15 +9,13 @@ from typing import Any
 from splatcli import console, log, options, progress, run_result, run_settings
 from splatcli.arguments import Cluster, Out, Photos, Run
 from splatcli.folders import DEFAULT, find_run_folder, run_folder_for
-from splatcli.input_files import check_files
 from stages.base.errors import UsageError
-from stages.base.settings import UNSET, changed
+from stages.base.settings import changed
 from stages.run import runfolder
 from stages.run.branch import branch
 from stages.run.listener import Listener, Listeners
 from stages.run.pipeline import Pipeline
 from stages.run.stages import STAGE_NAMES
-from stages.seed.settings import SPLATS_OF_A_STAGE
 from stages.viewer.live_training import LiveTraining
 from stages.viewer.server import open_in_browser
 
@@ -39,15 +37,8 @@ def process(
     pipeline = distributed(Pipeline(run_folder, photos), cluster)
     given = options.given_only(given)
     view, preset = given.pop("view", False), given.pop("preset", None)
-    if "formats" in given:
-        given["formats"] = pipeline.with_exported(given["formats"])
-    splats = given.get("splats", UNSET)
-    if splats is not UNSET and runfolder.is_run_folder(splats):
-        given["splats"] = _trained_splats(splats, run_folder)
     is_known = runfolder.is_run_folder(run_folder)
-    settings = run_settings.combined(run_settings.recorded(pipeline), given, preset)
-    if given.keys() & {"cameras", "splats"}:
-        check_files(settings)
+    settings = run_settings.requested(pipeline, given, preset)
     if is_known and console.mode.has_notes:
         console.note(run_settings.training_summary(settings["train"], given, preset))
     _run(pipeline, settings, view=view)
@@ -93,21 +84,6 @@ def _run_folder_and_photos(photos: Path | None, out: Path | None) -> tuple[Path,
     if out is None and folder != DEFAULT and console.mode.has_notes:
         console.note(f"Run folder: {folder}, since {DEFAULT} holds a run of other photographs.")
     return folder, photos
-
-
-def _trained_splats(run: Path, run_folder: Path) -> Path:
-    """The splats of the finished training of `run`, for `run_folder` to start from. Raises
-    SplatError."""
-    if run.resolve() == run_folder.resolve():
-        raise UsageError(
-            "option-out",
-            given=f"{run} would start from its own splats, and training replaces them.",
-            wanted="A folder of its own for the run that goes on from them.",
-            hint=f"splat process {run} --out NEW --splats {run} --steps 3000",
-        )
-    earlier = Pipeline(run)
-    earlier.load("train")  # raises if it has not finished, or is damaged
-    return earlier.stage_folder("train") / SPLATS_OF_A_STAGE
 
 
 def _run_stage(name: str, pipeline: Pipeline, given: Mapping[str, Any]) -> None:

@@ -45,7 +45,7 @@ class RunTask:
         is_url = isinstance(self.run_folder, str)
         return Path(tempfile.gettempdir()) if is_url else Path(self.run_folder)
 
-    def run(self, listener: Listener | None = None) -> None:
+    def run(self, listener: Listener | None = None, stop: Event | None = None) -> None:
         with local_copies(self.run_folder, self.photos) as (run_folder, photos, upload):
             listeners = Listeners(upload, listener or Listener())
             pipeline = Pipeline(run_folder, photos)
@@ -54,7 +54,8 @@ class RunTask:
                 for name, given in self.settings.items()
                 if name in SHARED_OPTIONS["formats"]
             }
-            pipeline.run({**self.settings, **formats}, until=self.until, listener=listeners)
+            settings = {**self.settings, **formats}
+            pipeline.run(settings, until=self.until, listener=listeners, stop=stop)
 
 
 def task_for(run_folder: Location, photos: Location, settings: Mapping[str, Any]) -> RunTask:
@@ -105,10 +106,13 @@ OpenExecutor = Callable[[Path, Listener], AbstractContextManager[Executor]]
 """open_executor(folder, listener): an executor for tasks in that folder."""
 
 
-def run_task(task: RunTask, listener: Listener | None = None) -> TaskResult:
-    """Run a task in this process. A failure becomes a result; only Interrupted is raised."""
+def run_task(
+    task: RunTask, listener: Listener | None = None, stop: Event | None = None
+) -> TaskResult:
+    """Run a task in this process, until `stop` is set or, without it, a signal comes. A failure
+    becomes a result; only Interrupted is raised."""
     try:
-        task.run(listener)
+        task.run(listener, stop)
     except Interrupted:
         raise
     except Exception as error:
@@ -169,4 +173,4 @@ class SerialExecutor:
         for number, task in enumerate(tasks):
             if stop is not None and stop.is_set():
                 raise Interrupted(f"before {task.folder}")
-            yield number, run_task(task, self.listener)
+            yield number, run_task(task, self.listener, stop)

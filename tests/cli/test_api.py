@@ -8,19 +8,19 @@ import subprocess
 import sys
 from pathlib import Path
 from threading import Event
-from typing import get_type_hints
+from typing import Any, get_type_hints
 
 import numpy as np
 import pytest
 from PIL import Image
 
 import splatcli
-from splatcli import Interrupted, SplatError, open_run, process
+from splatcli import Interrupted, SplatError, open_run, process, run_settings
 from splatcli.api import Options
 from stages.base.settings import settings_of
 from stages.run.pipeline import Pipeline
 from stages.run.stages import STAGES
-from stages.train.settings import TrainSettings
+from stages.train.settings import PRESETS, TrainSettings
 from tests import scenes
 from tests.processes import ROOT
 
@@ -108,6 +108,47 @@ def test_a_number_of_splats_that_is_given_holds_as_it_does_for_the_command(tmp_p
         process(photographs(tmp_path / "p"), tmp_path / "run", cancel=cancel, max_splats=400_000)
     train = Pipeline(tmp_path / "run").recorded_settings({"train": TrainSettings()})["train"]
     assert (train.max_splats, train.splats_per_view) == (400_000, 0)
+
+
+def recorded(folder: Path) -> dict[str, Any]:
+    return Pipeline(folder).recorded_settings(run_settings.defaults())
+
+
+def begun(folder: Path, **options: Any) -> dict[str, Any]:
+    """The settings that a run in `folder` records, which stops before its first stage."""
+    photos, cancel = folder / "p", Event()
+    cancel.set()
+    with pytest.raises(Interrupted):
+        process(
+            photos if photos.exists() else photographs(photos),
+            folder / "run",
+            cancel=cancel,
+            **options,
+        )
+    return recorded(folder / "run")
+
+
+def test_options_that_are_not_given_keep_the_values_of_the_run(tmp_path: Path) -> None:
+    first = begun(tmp_path, preset="preview", max_side=320)
+    assert begun(tmp_path) == begun(tmp_path, preset="preview") == first
+    assert (first["ingest"].max_side, first["train"]) == (320, PRESETS["preview"])
+    assert begun(tmp_path, preset="best")["ingest"].max_side == 320
+
+
+def test_paths_may_be_texts_and_are_taken_back_by_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert begun(tmp_path, masks="masks")["ingest"].masks == tmp_path / "masks"
+    assert begun(tmp_path, masks=None)["ingest"].masks is None
+
+
+def test_known_cameras_that_no_run_could_use_are_the_error_of_the_command(tmp_path: Path) -> None:
+    (tmp_path / "cameras.json").write_text("{")
+    with pytest.raises(SplatError) as caught:
+        process(photographs(tmp_path / "p"), tmp_path / "run", cameras=tmp_path / "cameras.json")
+    assert caught.value.code == "cameras-unreadable"
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:

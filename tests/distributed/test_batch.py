@@ -10,12 +10,14 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
 
 import pytest
 
 from stages.base.errors import SplatError
 from stages.distributed import cluster
-from stages.distributed.tasks import Resources
+from stages.distributed.tasks import Resources, RunTask, SerialExecutor
+from stages.run.listener import Listener
 from stages.run.lock import locked
 from tests.cli.pretence import failing_at
 
@@ -62,6 +64,19 @@ def test_formats_that_were_exported_stay(splat, captures) -> None:
     assert splat("batch", captures[0], "--format", "ply").exit_code == 0
     made = json.loads(Path("runs/hill/7-export/manifest.json").read_text())
     assert set(made["settings"]["formats"]) == {"splat", "ply"}
+
+
+def test_a_stop_that_is_given_reaches_each_run(tmp_path: Path) -> None:
+    """Otherwise it would take signals, which only a main thread may."""
+    seen: list[Event | None] = []
+
+    class Recording(RunTask):
+        def run(self, listener: Listener | None = None, stop: Event | None = None) -> None:
+            seen.append(stop)
+
+    stop = Event()
+    list(SerialExecutor().results([Recording(tmp_path)] * 2, Resources(None), stop))
+    assert seen == [stop, stop]
 
 
 def test_a_capture_that_fails_does_not_keep_the_others(splat, captures, pretend) -> None:
