@@ -10,6 +10,7 @@ highest is used.
 from __future__ import annotations
 
 import io
+import os
 import re
 from collections.abc import Container, Iterable, Mapping
 from pathlib import Path
@@ -25,7 +26,7 @@ from stages.cameras import nerfstudio
 from stages.cameras.nerfstudio import MILLIMETRE
 from stages.ingest.decode import Decoded, Unusable, check_size
 from stages.ingest.masking import turned_with
-from stages.ingest.masks import pair_masks
+from stages.ingest.masks import of_video, pair_masks
 from stages.ingest.sources import DepthFile, Findings, folder_beside, suffix_of
 from stages.scene import fitted_size
 
@@ -54,6 +55,17 @@ def files_of(source: Path) -> list[Path]:
     if not source.is_file():
         return [path for path in (source, source.with_name(CONFIDENCE)) if path.is_dir()]
     return [source, *nerfstudio.depth_maps(source)[0].values()]
+
+
+def folder_of(file: Path, source: Path) -> str:
+    """What tells a file or folder of `files_of(source)` from others of the same name: the start of
+    the names of its files, "" or one with a slash at its end."""
+    if file.name == CONFIDENCE and file != source:
+        return f"{CONFIDENCE}/"
+    if not source.is_file():
+        return ""
+    folder = Path(os.path.relpath(file.parent, source.parent)).as_posix()
+    return "" if folder == "." else f"{folder}/"
 
 
 def pair_depths(
@@ -109,9 +121,12 @@ def confidence_of(path: Path) -> Path | None:
 
 
 def check_paired(files: Findings, chosen: Path | None) -> None:
-    """Raises SplatError "depth-missing" if nothing in `chosen` is the map of a photograph."""
+    """Raises SplatError "depth-missing" if nothing in `chosen` is the map of a photograph, and
+    "ingest-video-alone"."""
     if chosen is not None and not files.depths:
-        photograph = (files.sources or files.videos)[0].name
+        if not files.sources:
+            raise of_video("depth maps", files)
+        photograph = files.sources[0].name
         raise SplatError(
             "depth-missing",
             given=f"{chosen} holds no depth map of a photograph such as {photograph}.",

@@ -39,11 +39,13 @@ def check_pairing(files: Findings, apart: Path | None, chosen: Path | None) -> N
         chosen: the folder that was given as a setting.
 
     Raises:
-        SplatError: "masks-missing" if `chosen` holds none, "masks-of-others" if no mask belongs to
-            a photograph by its name.
+        SplatError: "ingest-video-alone" if there are videos alone, "masks-missing" if `chosen`
+            holds none, "masks-of-others" if no mask belongs to a photograph by its name.
     """
     if files.masks or (chosen is None and (apart is not None or not files.stray_masks)):
         return
+    if files.videos and not files.sources:
+        raise of_video("masks", files)
     if chosen is not None and not files.stray_masks:
         raise SplatError(
             "masks-missing",
@@ -58,6 +60,20 @@ def check_pairing(files: Findings, apart: Path | None, chosen: Path | None) -> N
         given=f"No mask belongs to a photograph by its name: {mask}, say, and {photograph}.",
         wanted=f"For {photograph}: {stem}.png, {photograph}.png or {stem}_mask.png.",
         hint="If they are masks of another capture, remove them, or name a folder with --masks.",
+    )
+
+
+def of_video(what: str, files: Findings) -> SplatError:
+    """The error for masks, or other files of photographs, that were given for videos alone. what:
+    they are."""
+    video = files.videos[0]
+    return SplatError(
+        "ingest-video-alone",
+        given=f"There are {what}, and of photographs only videos ({video.name}).",
+        wanted=f"Photographs of the {what}: frames of a video have none before they are taken.",
+        hint=f"Leave the {what} away. To use them, copy the frames that this makes "
+        f"(1-ingest/{video.image}) into a folder of their own, and process it with {what} that "
+        "have the names of the frames.",
     )
 
 

@@ -49,6 +49,25 @@ def ingested(photos: Path, out: Path, frames: int = 0) -> tuple[Capture, dict[st
     return capture, dict(report.warnings), report
 
 
+@pytest.mark.parametrize("in_folder", [False, True])
+@pytest.mark.parametrize("option", ["masks", "depth"])
+def test_masks_and_depth_maps_of_a_video_are_refused_with_what_to_do(
+    video: Path, tmp_path: Path, option: str, in_folder: bool
+) -> None:
+    (tmp_path / "more").mkdir()
+    (tmp_path / "more" / "walk.mp4.png").write_bytes(b"")
+    settings = IngestSettings(**{option: tmp_path / "more"})  # type: ignore[arg-type]
+    photos = video
+    if in_folder:
+        photos = tmp_path / "films"
+        photos.mkdir()
+        video.rename(photos / "walk.mp4")
+    with pytest.raises(SplatError) as caught:
+        ingest.run({"photos": photos}, settings, tmp_path / "out", Report())
+    assert caught.value.code == "ingest-video-alone"
+    assert "1-ingest/photos/walk.mp4" in caught.value.hint
+
+
 def numbers(capture: Capture) -> list[int]:
     return [int(Path(photo.name).stem) for photo in capture.photos]
 
