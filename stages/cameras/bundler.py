@@ -75,11 +75,15 @@ def _numbers(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return cameras, np.array(rows, np.float64).reshape(-1, 7)
 
 
+def files(path: Path) -> list[Path]:
+    """The file and its list of pictures."""
+    file_of_names = _file_of_names(path)
+    return [path] if file_of_names is None else [path, file_of_names]
+
+
 def _names(path: Path) -> list[str]:
     """The first word of each line of the list of pictures."""
-    near = (path.with_suffix(".txt"), path.parent / "list.txt", path.parent.parent / "list.txt",
-            path.with_name(f"{path.name}.list.txt"))  # fmt: skip
-    file_of_names = next((file for file in near if file.is_file()), None)
+    file_of_names = _file_of_names(path)
     if file_of_names is None:
         raise BadFileError(
             f"there is no list of pictures (list.txt) beside {path.name}",
@@ -88,3 +92,9 @@ def _names(path: Path) -> list[str]:
         )
     lines = file_of_names.read_text(encoding="utf-8").splitlines()
     return [line.split()[0] for line in lines if line.strip()]
+
+
+def _file_of_names(path: Path) -> Path | None:
+    near = (path.with_suffix(".txt"), path.parent / "list.txt", path.parent.parent / "list.txt",
+            path.with_name(f"{path.name}.list.txt"))  # fmt: skip
+    return next((file for file in near if file.is_file()), None)

@@ -81,7 +81,10 @@ CAMERA_FILES = (
         *(colmap.locate, colmap.read, colmap.read_points, colmap.files),
     ),
     CameraFormat("LLFF's poses_bounds.npy", llff.locate, llff.read),
-    CameraFormat("Bundler's .out", _suffixed(".out"), bundler.read, bundler.read_points),
+    CameraFormat(
+        "Bundler's .out",
+        *(_suffixed(".out"), bundler.read, bundler.read_points, bundler.files),
+    ),
     CameraFormat("Metashape's cameras as .xml", _suffixed(".xml"), metashape.read),
     CameraFormat("RealityScan's camera parameters as .csv", _suffixed(".csv"), realityscan.read),
     CameraFormat(

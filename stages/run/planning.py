@@ -134,8 +134,8 @@ class Planner:
                 records_of[name] = known[name]
                 continue
             records_of[name] = {}
-            for file in files:  # maps of depth and of confidence have the same names
-                lead = f"{file.name}/" if file.name == depth_files.CONFIDENCE else ""
+            for file in files:
+                lead = depth_files.folder_of(file, path) if name == DEPTH else ""
                 old = known.get(name, {}).items()
                 before = {key[len(lead) :]: one for key, one in old if key.startswith(lead)}
                 records = record_files(file, before, users=True)

@@ -98,7 +98,7 @@ def test_nerfstudios_points_come_back_into_the_cameras_world(tmp_path: Path) -> 
     assert found is not None
     np.testing.assert_allclose(found.points, POINTS, atol=1e-6)
     (tmp_path / "splats.ply").write_bytes(b"")
-    assert {path.name for path in files_of(target)} == {"again.json", "again.ply"}
+    assert {path.name for path in files_of(target)} == {"again.json", "again_points.ply"}
 
 
 def test_files_beside_a_colmap_model_are_no_part_of_it(tmp_path: Path) -> None:
@@ -158,6 +158,12 @@ def test_entities_of_xml_are_refused_in_every_encoding(tmp_path: Path, encoding:
     path.write_bytes(written.encode(encoding))
     with pytest.raises(SplatError, match="entities"):
         read_cameras(path)
+
+
+def test_bundlers_list_of_pictures_is_among_its_files(tmp_path: Path) -> None:
+    """Another order gives the pictures other cameras."""
+    files = files_of(MADE["bundler"](tmp_path))
+    assert {path.name for path in files} == {"bundle.out", "list.txt"}
 
 
 def test_bundlers_missing_list_may_be_written(tmp_path: Path) -> None:

@@ -188,6 +188,30 @@ def test_added_and_removed_photographs_are_named(finished: Pipeline, photos: Pat
     assert reasons(finished)["copy"] == "photograph b.jpg is missing, photograph c.jpg is new"
 
 
+@dataclasses.dataclass(frozen=True)
+class WithDepth(CopySettings):
+    depth: Path | None = dataclasses.field(default=None, metadata={"help": "maps"})
+
+
+def test_each_of_several_depth_maps_of_one_name_is_a_reason(
+    photos: Path, run_folder: Path, tmp_path: Path
+) -> None:
+    frames = []
+    for camera in ("left", "right"):
+        (tmp_path / "maps" / camera).mkdir(parents=True)
+        (tmp_path / "maps" / camera / "1.png").write_text(camera)
+        frames.append({"file_path": camera, "depth_file_path": f"{camera}/1.png"})
+    file = tmp_path / "maps" / "transforms.json"
+    file.write_text(json.dumps({"frames": frames}))
+    stages = fake_stages()
+    stages[0] = dataclasses.replace(stages[0], settings_type=WithDepth)
+    pipeline = Pipeline(run_folder, photos, stages)
+    pipeline.run({"copy": WithDepth(depth=file)})
+    assert ran(pipeline) == []
+    (tmp_path / "maps" / "left" / "1.png").write_text("changed")
+    assert reasons(pipeline)["copy"] == "depth left/1.png changed"
+
+
 def test_hidden_files_among_photographs_do_not_count(finished: Pipeline, photos: Path) -> None:
     (photos / ".DS_Store").write_text("desktop")
     assert ran(finished) == []
