@@ -59,16 +59,23 @@ def view(
     ] = None,
     title: Annotated[str | None, _of_page("The page's title.", "the file's name")] = None,
     background: Annotated[
-        str, _of_page("The colour behind the splats.", metavar="#RRGGBB")
-    ] = "#000000",
+        str | None, _of_page("The colour behind the splats.", "#000000", metavar="#RRGGBB")
+    ] = None,
 ) -> None:
     """Show the splats in a browser: orbit, fly, stand where the photographs were taken.
 
     The page is served to this machine only and needs no network. Ctrl-C ends it.
     """
     if save is not None:
-        _save(target, save, camera, title, background)
+        _save(target, save, camera, title, background or "#000000")
         return
+    if not (camera is None and title is None and background is None):
+        raise UsageError(
+            "option-alone",
+            given="--camera, --title and --background mean nothing without --save.",
+            wanted="A page that is written.",
+            hint="Add --save PAGE.html, or leave them out.",
+        )
     remove_abandoned_files(Path(tempfile.gettempdir()))  # of a view that was killed
     with (
         one_signal_stops(),

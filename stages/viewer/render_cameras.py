@@ -67,7 +67,7 @@ def camera_of_view(splats: Splats, views: Sequence[View], name: str | None) -> C
     ):
         if len(candidates) == 1:
             return candidates[0]
-    if name.isdigit() and int(name) < len(views):
+    if name.isdecimal() and int(name) < len(views):
         return views[int(name)].camera
     known = f"{views[0].name} ... {views[-1].name}" if views else "none: a file has no cameras"
     raise UsageError(

@@ -192,6 +192,13 @@ def test_a_picture_larger_than_memory_is_refused_at_once(splat, scene: Path, mon
     assert "smaller --width" in result.stderr
 
 
+@pytest.mark.parametrize("name", ["²", "٣", "-1", "1e3"])
+def test_a_camera_that_is_no_name_and_no_number_is_refused(splat, scene: Path, name: str) -> None:
+    result = splat("render", str(scene), "--out", "a.png", f"--camera={name}")
+    assert result.exit_code == 2
+    assert "render-camera" in result.stderr
+
+
 def test_a_file_without_cameras_is_no_path(splat, scene: Path) -> None:
     Path("t.json").write_text('{"w": 1, "h": 1, "fl_x": 1, "frames": []}')
     result = splat("render", str(scene), "--path", "t.json", "--out", "a.mp4")

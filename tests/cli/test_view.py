@@ -35,6 +35,13 @@ os.execv(sys.executable, [sys.executable, "-m", "splatcli", *sys.argv[1:]])
 """
 
 
+@pytest.mark.parametrize("words", ["--camera nope", "--title A", "--background #ffffff"])
+def test_options_of_a_page_that_is_written_are_refused_without_it(splat, words: str) -> None:
+    result = splat("view", "scene.ply", *words.split())
+    assert result.exit_code == 2
+    assert "option-alone" in result.stderr
+
+
 @pytest.mark.skipif(os.name != "posix", reason="sends the signal of Ctrl-C")
 @pytest.mark.parametrize(
     ("suffix", "stop"),
