@@ -123,13 +123,15 @@ def pruner_of(
     """
     extent = training_extent(reconstruction)
     finetuner = FineTuner(training, extent, backend, report, trained.dropout)
+    size_bytes = _size_measure(settings, trained.splats, training, reconstruction)
     targets = Targets(
         strength=settings.strength,
         max_loss_db=settings.max_loss_db,
         max_splats=settings.max_splats,
         max_bytes=settings.max_mb * 1e6,
         min_psnr_db=settings.min_psnr,
-        size_bytes=_size_measure(settings, trained.splats, training, reconstruction),
+        size_bytes=size_bytes,
+        least_bytes=size_bytes(trained.splats.take(slice(1))) if settings.max_mb else 0,
     )
     limits = settings.rounds, settings.finetune_steps
     return Pruner(training, targets, backend, finetuner, *limits, report, deadline)

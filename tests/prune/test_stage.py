@@ -224,6 +224,19 @@ def test_a_size_in_megabytes_is_met_from_below(scene, tmp_path) -> None:
     assert 0.95 * 16_000 < path.stat().st_size <= 16_000
 
 
+@pytest.mark.parametrize("kept", [1, 20, 150])
+def test_a_size_that_is_mostly_the_page_is_met(scene, tmp_path, kept: int) -> None:
+    reconstruction = scene.reconstruction
+    known = {"units": reconstruction.units, "views": reconstruction.views}
+    path = tmp_path / "scene.html"
+    formats.write(path, scene.splats.take(slice(kept)), **known)
+    wanted = 1.001 * path.stat().st_size
+    result, _ = run(scene, scene.splats, tmp_path, max_mb=wanted / 1e6, mb_of="html")
+    formats.write(path, result, **known)
+    assert path.stat().st_size <= wanted
+    assert len(result) > 0.8 * kept
+
+
 def test_a_round_that_is_predicted_to_cost_too_much_is_not_measured(
     scene, tmp_path, monkeypatch
 ) -> None:
