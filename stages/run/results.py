@@ -79,7 +79,7 @@ def newest_splats(pipeline: Pipeline, antialias: bool = True) -> Splats:
 
 
 def reconstruction_of(pipeline: Pipeline) -> Reconstruction:
-    """The capture's cameras, as training has refined them. Raises SplatError
+    """The capture, with the cameras and masks of training where it has finished. Raises SplatError
     (stage-not-finished)."""
     reconstruction: Reconstruction = pipeline.load("sfm")
     if not _is_trained(pipeline):
@@ -120,10 +120,11 @@ def exported_formats(pipeline: Pipeline) -> dict[str, dict[str, Any]]:
 
 
 def views_of(pipeline: Pipeline | None) -> tuple[View, ...]:
-    """The capture's views, sorted by name; empty without a finished reconstruction."""
+    """The capture's views, as training has refined them, sorted by name; empty without a finished
+    reconstruction."""
     if pipeline is None or pipeline.manifest("sfm") is None:
         return ()
-    return tuple(sorted(pipeline.load("sfm").views, key=lambda view: view.name))
+    return tuple(sorted(reconstruction_of(pipeline).views, key=lambda view: view.name))
 
 
 def training_side_of(pipeline: Pipeline | None) -> int:
