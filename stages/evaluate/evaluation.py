@@ -38,8 +38,8 @@ class EvaluationView:
         pixels: [H, W, 3] uint8, sRGB.
         mask: [H, W], as in `scene.Photo`; None where all pixels count.
         outside: what is outside the mask, as in `scene.Photo`.
-        saturated: [H, W] pixels with a channel too bright to be measured, which are not compared;
-            None where there are none.
+        excluded: [H, W] further pixels that are not compared, as those with a channel too bright
+            to be measured; None where there are none.
     """
 
     name: str
@@ -47,7 +47,7 @@ class EvaluationView:
     pixels: NDArray[np.uint8]
     mask: NDArray[np.uint8] | None = None
     outside: str = ""
-    saturated: NDArray[np.bool_] | None = None
+    excluded: NDArray[np.bool_] | None = None
 
     @property
     def image(self) -> NDArray[np.float32]:
@@ -58,9 +58,9 @@ class EvaluationView:
     def valid(self) -> NDArray[np.bool_] | None:
         """[H, W] the pixels that are compared, or None for all."""
         valid = self.mask > 0 if self.mask is not None and self.outside == IGNORE else None
-        if self.saturated is None:
+        if self.excluded is None:
             return valid
-        return ~self.saturated if valid is None else valid & ~self.saturated
+        return ~self.excluded if valid is None else valid & ~self.excluded
 
     def in_median_light(self, light: Light | None) -> EvaluationView:
         """With the exposure and white balance of the median photograph; see `scene.light`."""
@@ -71,7 +71,16 @@ class EvaluationView:
         solid = np.float32(1) if alpha is None else alpha[..., None] * np.float32(1 / 255)
         even = (self.image - offsets * solid) / gains
         pixels = np.rint(even * 255).clip(0, 255).astype(np.uint8)
-        return replace(self, pixels=pixels, saturated=np.asarray((self.image >= BRIGHT).any(2)))
+        return replace(self, pixels=pixels, excluded=np.asarray((self.image >= BRIGHT).any(2)))
+
+    def compared_within(self, valid: NDArray[np.bool_] | None) -> EvaluationView:
+        """The same, where only pixels of `valid` [h, w] are compared; at another size, those of
+        which all that they cover is valid. None: all."""
+        if valid is None:
+            return self
+        height, width = self.pixels.shape[:2]
+        outside = np.asarray(scaled_image((~valid).astype(np.float32), width, height) > 0)
+        return replace(self, excluded=outside if self.excluded is None else self.excluded | outside)
 
     def scaled(self, scale: float) -> EvaluationView:
         """At `scale` (at most 1) times the size along each side, by area averaging as in
@@ -82,13 +91,13 @@ class EvaluationView:
             *(max(1, round(scale * side)) for side in (self.camera.width, self.camera.height))
         )
         size = camera.width, camera.height
-        mask, saturated = self.mask, self.saturated
+        mask, excluded = self.mask, self.excluded
         if mask is not None:
             mask = scaled_mask(mask, *size, self.outside)
-        if saturated is not None:
-            saturated = scaled_image(saturated.astype(np.float32), *size) > 0
+        if excluded is not None:
+            excluded = scaled_image(excluded.astype(np.float32), *size) > 0
         pixels = np.rint(scaled_image(self.image, *size) * 255).astype(np.uint8)
-        return replace(self, camera=camera, pixels=pixels, mask=mask, saturated=saturated)
+        return replace(self, camera=camera, pixels=pixels, mask=mask, excluded=excluded)
 
     def over(self, grey: float) -> EvaluationView:
         """Composited over `grey` (0 to 1) instead of black, where it has transparency."""

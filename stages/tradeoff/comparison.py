@@ -89,7 +89,8 @@ class Comparison:
 
 def compare_runs(first: Candidate, second: Candidate) -> Comparison:
     """Evaluate both on the views that both hold out, at the smaller size of the two, each with its
-    own run's camera. Raises SplatError (compare-nothing-in-common)."""
+    own run's camera, on the pixels that count in both. Raises SplatError
+    (compare-nothing-in-common)."""
     training, names = (sorted(a.keys() & b) for a, b in zip(first.split, second.split, strict=True))
     if not names:
         raise UsageError(
@@ -101,7 +102,7 @@ def compare_runs(first: Candidate, second: Candidate) -> Comparison:
     both = (first, second)
     side_px = min(one.side_px(name) for one in both for name in names)
     names, count = [*names, *evenly_spaced(training, TRAINING_VIEWS)], len(names)
-    views = (first.views(names, side_px), second.views(names, side_px))
+    views = _on_common_pixels(first.views(names, side_px), second.views(names, side_px))
     a, b = (
         evaluate_at_sizes(image_renderer(one.splats, one.backend), seen)
         for one, seen in zip(both, views, strict=True)
@@ -111,6 +112,18 @@ def compare_runs(first: Candidate, second: Candidate) -> Comparison:
     a, b = ({size: scores[:count] for size, scores in found.items()} for found in (a, b))
     views = (views[0][:count], views[1][:count])
     return Comparison(both, views, (a, b), ssim, psnr, side_px)
+
+
+def _on_common_pixels(
+    first: Sequence[EvaluationView], second: Sequence[EvaluationView]
+) -> tuple[tuple[EvaluationView, ...], tuple[EvaluationView, ...]]:
+    """The same views of both, compared where both masks are valid: the run with the smaller ones
+    would be better because they leave out what is hard to draw."""
+    pairs = list(zip(first, second, strict=True))
+    return (
+        tuple(a.compared_within(b.valid) for a, b in pairs),
+        tuple(b.compared_within(a.valid) for a, b in pairs),
+    )
 
 
 def verdict_lines(comparison: Comparison) -> list[str]:

@@ -113,12 +113,27 @@ def test_a_scaled_view_is_the_photograph_at_that_size(scene: SmallScene) -> None
 
 def test_a_pixel_counts_at_a_smaller_size_if_all_that_it_averages_counts() -> None:
     camera = Camera(8, 8, 10.0, 10.0, 4.0, 4.0, np.eye(4))
-    mask, saturated = np.full((8, 8), 255, np.uint8), np.zeros((8, 8), bool)
-    mask[0, 1], saturated[7, 7] = 0, True
-    view = EvaluationView("a", camera, np.zeros((8, 8, 3), np.uint8), mask, IGNORE, saturated)
+    mask, excluded = np.full((8, 8), 255, np.uint8), np.zeros((8, 8), bool)
+    mask[0, 1], excluded[7, 7] = 0, True
+    view = EvaluationView("a", camera, np.zeros((8, 8, 3), np.uint8), mask, IGNORE, excluded)
     wanted = np.ones((4, 4), bool)
     wanted[0, 0] = wanted[3, 3] = False
     np.testing.assert_array_equal(view.scaled(0.5).valid, wanted)
+
+
+def test_views_of_two_sizes_are_compared_on_pixels_that_are_valid_in_both() -> None:
+    camera = Camera(4, 4, 5.0, 5.0, 2.0, 2.0, np.eye(4))
+    view = EvaluationView("a", camera, np.zeros((4, 4, 3), np.uint8))
+    assert view.compared_within(None).valid is None
+    valid = np.ones((8, 8), bool)
+    valid[0, 1] = False
+    wanted = np.ones((4, 4), bool)
+    wanted[0, 0] = False
+    first = view.compared_within(valid)
+    np.testing.assert_array_equal(first.valid, wanted)
+    second = np.ones((4, 4), bool)
+    second[3, 3] = wanted[3, 3] = False
+    np.testing.assert_array_equal(first.compared_within(second).valid, wanted)
 
 
 def test_an_evaluation_at_sizes_draws_each_size_and_begins_with_the_full_one(

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from stages.base.errors import SplatError
 from stages.base.stage import Report
@@ -16,6 +17,7 @@ from stages.formats import FORMATS
 from stages.prune.settings import PruneSettings
 from stages.prune.stage import pruner_of
 from stages.scene import (
+    IGNORE,
     DrawSettings,
     QuantisedSplats,
     TrainedSplats,
@@ -252,6 +254,32 @@ def test_a_comparison_says_which_run_is_better_at_each_size(scene) -> None:
     assert [row[0] for row in fact_rows(found)][:3] == [
         f"held-out PSNR, {size} size" for size in ("full", "half", "quarter")
     ]
+
+
+def masked(scene, candidate: Candidate, name: str, mask: np.ndarray) -> Candidate:
+    """A run whose views ignore what is outside `mask`, a file of this name."""
+    reconstruction = scene.reconstruction
+    Image.fromarray(np.where(mask, 255, 0).astype(np.uint8)).save(reconstruction.folder / name)
+    views = (replace(view, mask=name, outside=IGNORE) for view in reconstruction.views)
+    return replace(candidate, reconstruction=replace(reconstruction, views=tuple(views)))
+
+
+def test_a_run_is_not_better_for_ignoring_what_it_draws_wrong(scene) -> None:
+    middle = np.zeros((54, 72), bool)
+    middle[10:44, 16:56] = True
+    inside = (np.abs(scene.splats.means) < 0.35).all(1)
+    sh = scene.splats.sh.copy()
+    sh[inside] += np.float32(0.3)
+    wrong = side(scene, "wrong", replace(scene.splats, sh=sh))
+    brighter = replace(scene.splats, sh=scene.splats.sh + np.float32(0.02))
+    first, second = side(scene, "first", brighter), masked(scene, wrong, "outer.png", ~middle)
+    found = compare_runs(first, second)
+    equal = compare_runs(masked(scene, first, "outer.png", ~middle), second)
+    assert found.psnr == equal.psnr
+    assert {size: d.mean for size, d in found.psnr_by_size.items()} == {
+        size: d.mean for size, d in equal.psnr_by_size.items()
+    }
+    assert found.ssim == equal.ssim
 
 
 def test_both_are_compared_at_the_smaller_size(scene) -> None:
