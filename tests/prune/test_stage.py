@@ -253,11 +253,18 @@ def test_a_round_that_is_predicted_to_cost_too_much_is_not_measured(
     assert len(measured) == 1  # before the first round
 
 
-def test_a_psnr_is_met_and_no_better_than_needed(scene, tmp_path) -> None:
-    wanted = training_db(scene, scene.splats) - 3
-    result, _ = run(scene, scene.splats, tmp_path, min_psnr=wanted, rounds=40)
+@pytest.mark.parametrize("lower_db", [3, 18])
+def test_a_psnr_is_met_and_no_better_than_needed(scene, tmp_path, lower_db: int) -> None:
+    wanted = training_db(scene, scene.splats) - lower_db  # the second needs many rounds
+    result, report = run(scene, scene.splats, tmp_path, min_psnr=wanted)
     assert wanted <= training_db(scene, result) < wanted + 0.5
     assert len(result) < len(scene.splats)
+    assert report.metrics["stopped_by"] == "loss"
+
+
+def test_a_psnr_with_no_rounds_removes_nothing(scene, tmp_path) -> None:
+    result, _ = run(scene, scene.splats, tmp_path, min_psnr=10, rounds=0)
+    assert len(result) == len(scene.splats)
 
 
 @pytest.mark.parametrize(
