@@ -197,7 +197,7 @@ def test_a_run_without_a_log_gets_the_other_curves(inputs, tmp_path) -> None:
     tradeoff = measure_tradeoff(replace(inputs, history=()), lambda label: None)
     files = write_report(tmp_path, "scene", tradeoff, inputs)
     assert "time.png" not in {file.name for file in files}
-    assert report_text.NO_TIMES in (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert report_text.NO_COURSE in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow
