@@ -24,6 +24,7 @@ from stages.evaluate.evaluation import (
     mean_psnr_db,
     psnr_of_views_db,
 )
+from stages.evaluate.selection import FEW_VIEWS
 from stages.formats.format_table import FORMATS
 from stages.formats.sog_bits import choose_bits, file_size_bytes
 from stages.prune.rounds import Pruner, PruningResult
@@ -83,7 +84,9 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     requested = found.forced or settings.min_psnr > 0
     if pruner.targets.broken_by(loss_db) and not requested:
         report.warn("prune-loss-above-limit", describe_loss(loss_db, pruner.targets))
-    if advice := advise_more_splats(found, settings.strength):
+    # of fewer views no splat is seen by enough to be removed, however many there are
+    enough = len(training) >= FEW_VIEWS
+    if enough and (advice := advise_more_splats(found, settings.strength)):
         report.warn("prune-more-would-pay", advice)
     assert np.isfinite(found.splats.means).all()
     save_splats(folder, found.splats)

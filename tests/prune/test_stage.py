@@ -181,6 +181,16 @@ def test_held_out_views_that_lose_more_are_in_a_warning(scene, tmp_path) -> None
     assert [code for code, _ in report.warnings] == ["prune-loss-above-limit"]
 
 
+@pytest.mark.parametrize(("count", "advised"), [(1, False), (2, False), (3, True)])
+def test_more_splats_are_not_advised_where_too_few_views_decide(
+    tmp_path, count: int, advised: bool
+) -> None:
+    scene = small_scene(tmp_path, n=60)  # of which each tenth is needed
+    few = replace(scene.reconstruction, views=scene.reconstruction.views[:count])
+    _, report = run(replace(scene, reconstruction=few), scene.splats, tmp_path)
+    assert ("prune-more-would-pay" in dict(report.warnings)) == advised
+
+
 def test_at_low_strength_nothing_is_removed_that_the_views_show(scene, tmp_path) -> None:
     result, report = run(scene, scene.splats, tmp_path, strength=0.001, max_loss_db=100)
     assert report.metrics["stopped_by"] == "rate_distortion"
