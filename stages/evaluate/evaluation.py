@@ -62,6 +62,11 @@ class EvaluationView:
             return valid
         return ~self.excluded if valid is None else valid & ~self.excluded
 
+    @property
+    def counts(self) -> bool:
+        """Whether any pixel is compared."""
+        return self.valid is None or bool(self.valid.any())
+
     def in_median_light(self, light: Light | None) -> EvaluationView:
         """With the exposure and white balance of the median photograph; see `scene.light`."""
         if light is None:
@@ -111,13 +116,18 @@ class EvaluationView:
 class Score:
     """How near one drawing is to its photograph, by the definitions in `image_metrics`. psnr_db: at
     most `IDENTICAL_DB`. flip: None where it was not computed. inside_db: PSNR inside the mask of a
-    transparent photograph."""
+    transparent photograph. PSNR and SSIM are NaN where no pixel is compared: see `counts`."""
 
     name: str
     psnr_db: float
     ssim: float
     flip: float | None = None
     inside_db: float | None = None
+
+    @property
+    def counts(self) -> bool:
+        """Whether any pixel was compared. Means are of such scores alone."""
+        return not np.isnan(self.psnr_db)
 
 
 class _EvaluationViews(Sequence[EvaluationView]):
@@ -221,13 +231,16 @@ def evaluate_at_sizes(
         with_flip: as in `evaluate`, of the full size.
 
     Returns:
-        The scores of the views by the name of the size.
+        The scores of all views, in their order, by the name of the size.
     """
     scores: dict[str, list[Score]] = {name: [] for name in sizes}
     with_flip_too = evaluation_subset(len(views)) if with_flip and has_flip() else ()
     for number, full in enumerate(views):
         for name, scale in sizes.items():
             view = full.scaled(scale)
+            if not view.counts:
+                scores[name].append(Score(view.name, np.nan, np.nan))
+                continue
             image, truth = np.clip(draw(view.camera), 0.0, 1.0), view.image
             valid = view.valid
             flips = scale == 1 and number in with_flip_too
@@ -252,6 +265,8 @@ def psnr_as_taken_db(
     unadapted, adapted = [], []
     as_taken = replace(draw_settings, light=False)
     for view in load_evaluation_views(folder, views, as_taken):
+        if not view.counts:
+            continue
         image, truth = np.clip(draw(view.camera), 0.0, 1.0), view.image
         half, everywhere = truth.shape[1] // 2, np.ones(truth.shape[:2], bool)
         valid = everywhere if view.valid is None else view.valid
@@ -284,17 +299,22 @@ def image_renderer(splats: Splats, backend: str) -> ImageRenderer:
 def psnr_of_views_db(
     splats: Splats, views: Iterable[EvaluationView], backend: str
 ) -> NDArray[np.float64]:
-    """[V] PSNR of each view, dB."""
+    """[V] PSNR of each view, dB; NaN where no pixel is compared."""
     draw = image_renderer(splats, backend)
-    return np.array([capped_psnr_db(draw(v.camera), v.image, v.valid) for v in views])
+    return np.array(
+        [capped_psnr_db(draw(v.camera), v.image, v.valid) if v.counts else np.nan for v in views]
+    )
 
 
 def mean_psnr_db(
     splats: Splats, views: Iterable[EvaluationView], backend: str, scale: float = 1.0
 ) -> float:
-    """Mean PSNR over the views, each `EvaluationView.scaled`, dB."""
+    """Mean PSNR over the views, each `EvaluationView.scaled`, of which a pixel is compared, dB; 0
+    if there is none."""
     scaled = (view.scaled(scale) for view in views)
-    return float(psnr_of_views_db(splats, scaled, backend).mean())
+    found = psnr_of_views_db(splats, scaled, backend)
+    found = found[~np.isnan(found)]
+    return float(found.mean()) if found.size else 0.0
 
 
 def psnr_name(size: str, stem: str = "psnr") -> str:

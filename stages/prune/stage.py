@@ -66,11 +66,14 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
         )
         for views in (chosen, [held_out[i] for i in evaluation_subset(len(held_out))])
     )
-    evaluated = evaluated or training
     before_db = psnr_of_views_db(splats, evaluated, backend)
+    if np.isnan(before_db).all():  # no view is held out, or no pixel of one counts
+        evaluated = training
+        before_db = psnr_of_views_db(splats, evaluated, backend)
     pruner = pruner_of(settings, reconstruction, trained, training, backend, report, deadline)
     found = pruner.prune(splats)
     loss_db = before_db - psnr_of_views_db(found.splats, evaluated, backend)
+    before_db, loss_db = (db[~np.isnan(before_db)] for db in (before_db, loss_db))
     report_backend(report, backend)
     report.metric("evaluated_side_px", splats.draw_settings.side)
     mean_db, lost_db = float(before_db.mean()), float(loss_db.mean())

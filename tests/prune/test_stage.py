@@ -198,6 +198,25 @@ def test_at_low_strength_nothing_is_removed_that_the_views_show(scene, tmp_path)
     assert len(result) > 0.8 * len(scene.splats)
 
 
+def test_held_out_views_without_a_pixel_that_counts_are_in_no_figure(scene, tmp_path) -> None:
+    """Masks leave nothing of one held-out view of two, or of both."""
+    Image.fromarray(np.zeros((54, 72), np.uint8)).save(tmp_path / "nothing.png")
+    held_out = split_held_out(scene.reconstruction.views)[1]
+    figures = []
+    for names in ([held_out[0].name], [view.name for view in held_out]):
+        views = tuple(
+            replace(view, mask=str(tmp_path / "nothing.png"), outside=IGNORE)
+            if view.name in names
+            else view
+            for view in scene.reconstruction.views
+        )
+        masked = replace(scene, reconstruction=replace(scene.reconstruction, views=views))
+        _, report = run(masked, scene.splats, tmp_path)
+        figures.append([v for name, v in report.metrics.items() if name.startswith("psnr_")])
+    assert np.isfinite(figures).all()
+    assert min(before for before, *_ in figures) > 30
+
+
 def test_the_loss_of_a_round_is_predicted(scene, tmp_path) -> None:
     _, report = run(scene, scene.splats, tmp_path, max_splats=230)
     first = report.metrics["rounds"][0]

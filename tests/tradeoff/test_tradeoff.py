@@ -282,6 +282,45 @@ def test_a_run_is_not_better_for_ignoring_what_it_draws_wrong(scene) -> None:
     assert found.ssim == equal.ssim
 
 
+def held_out_masked(scene, candidate: Candidate, names: list[str], mask: np.ndarray) -> Candidate:
+    """A run in which views of these names ignore what is outside `mask`."""
+    reconstruction = scene.reconstruction
+    everywhere = masked(scene, candidate, "held_out.png", mask).reconstruction.views
+    views = [
+        one if one.name in names else view
+        for one, view in zip(everywhere, reconstruction.views, strict=True)
+    ]
+    return replace(candidate, reconstruction=replace(reconstruction, views=tuple(views)))
+
+
+@pytest.mark.parametrize("share", [0, 1 / 2])  # of the columns, every other one
+def test_a_view_without_a_pixel_that_counts_is_not_compared(scene, share: float) -> None:
+    names = [view.name for view in split_held_out(scene.reconstruction.views)[1]]
+    assert len(names) == 2
+    mask = np.zeros((54, 72), bool)
+    mask[:, ::2] = share > 0
+    fewer = side(scene, "fewer", scene.splats.take(slice(0, 120)))
+    found = compare_runs(side(scene, "all"), held_out_masked(scene, fewer, names[:1], mask))
+    assert found.psnr.views == 1
+    assert [view.name for view in found.views[0]] == names[1:]
+    assert [score.name for score in found.scores[1]] == names[1:]
+    with pytest.raises(SplatError) as error:
+        compare_runs(side(scene, "all"), held_out_masked(scene, fewer, names, mask))
+    assert error.value.code == "compare-no-pixels"
+
+
+def test_a_view_without_a_pixel_that_counts_is_in_no_operating_point(scene, inputs) -> None:
+    few = replace(inputs, prune_to=None, held_out=list(inputs.held_out))
+    nothing = np.zeros((54, 72), np.uint8)
+    few.held_out[0] = replace(few.held_out[0], mask=nothing, outside=IGNORE)
+    first, second = (
+        measure_tradeoff(one, lambda label: None)
+        for one in (few, replace(few, held_out=few.held_out[1:]))
+    )
+    assert first.own == second.own
+    assert first.scores == second.scores
+
+
 def test_both_are_compared_at_the_smaller_size(scene) -> None:
     small = side(scene, "small")
     small = replace(
