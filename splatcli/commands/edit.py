@@ -113,12 +113,12 @@ def _load_scene(source: Path, antialias: bool) -> tuple[EditedScene, int]:
         raise nothing_drawable(source, dropped)
     if pipeline is None or pipeline.manifest("sfm") is None:
         return EditedScene(splats, units_of(source)), dropped
-    sfm = pipeline.load("sfm")
-    training, held = split_held_out(sfm.views)
-    photographs = load_evaluation_views(sfm.folder, training, splats.draw_settings)
-    evaluation = load_evaluation_views(sfm.folder, held, splats.draw_settings) or photographs
+    capture = results.reconstruction_of(pipeline)
+    training, held = split_held_out(capture.views)
+    photographs = load_evaluation_views(capture.folder, training, splats.draw_settings)
+    evaluation = load_evaluation_views(capture.folder, held, splats.draw_settings) or photographs
     scene = EditedScene(
-        *(splats, sfm.units, photographs, evaluation, sfm.views),
+        *(splats, capture.units, photographs, evaluation, capture.views),
         backend=results.backend_of_run(pipeline),
     )
     return scene, dropped

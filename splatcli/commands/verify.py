@@ -174,7 +174,8 @@ def _of_run(run: Pipeline) -> _Original:
     """The splats that the run's export writes to a file, which may be fine-tuned for its format;
     then the splats that a conversion would write."""
     quantised: QuantisedSplats = run.load("quantise")
-    cameras = cameras_for(drop_undrawable(quantised.splats)[0], run.load("sfm").views)
+    views = results.reconstruction_of(run).views
+    cameras = cameras_for(drop_undrawable(quantised.splats)[0], views)
     prover_of = provers_of(quantised, cameras, results.backend_of_run(run))
 
     def provers(file: Path) -> Iterator[Prover]:

@@ -144,14 +144,16 @@ def _items(
     """The items to serve. The splats are written to `content` as .ply, which the page reads best;
     a lod-meta.json is served as it is."""
     run = pipeline or results.run_around(target)
-    sfm = run.load("sfm") if run is not None and run.manifest("sfm") is not None else None
-    units = sfm.units if sfm else "arbitrary"
+    capture = None
+    if run is not None and run.manifest("sfm") is not None:
+        capture = results.reconstruction_of(run)
+    units = capture.units if capture else "arbitrary"
     row = format_of(target) if pipeline is None and target is not None else None
     if target is not None and row is not None and row.streamed and row.takes_views:
         content = target
     else:
         ply.write(content, splats, units=units)
-    views, photos = (sfm.views, sfm.folder) if sfm else ((), None)
+    views, photos = (capture.views, capture.folder) if capture else ((), None)
     source = str(pipeline.run_folder if pipeline is not None else target)
     items = site(_title(target, pipeline), splats, content, views, photos, units, source)
     return {**items, "/point": _print_point}

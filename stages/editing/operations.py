@@ -202,13 +202,15 @@ def _limiting_size(max_bytes: float, target: Path) -> Operation:
         least = size_bytes(scene.with_splats(scene.splats.take(slice(1))))
         if least > max_bytes:
             raise _too_small(max_bytes, least, 1, row)
-        for _ in range(_ATTEMPTS):
+        for attempts_left in range(_ATTEMPTS, -1, -1):
             size, count = size_bytes(scene), len(scene.splats)
             if size <= max_bytes:
                 return scene
-            if count == 1:
+            if count == 1 or not attempts_left:
                 break
-            fewer = int(_SAFETY * count * max_bytes / size)
+            # a page takes two megabytes without its splats
+            share = (max_bytes - least) / (size - least)
+            fewer = 1 + int(_SAFETY * (count - 1) * share)
             scene = scene.with_splats(decimate(scene.splats, fewer))
         raise _too_small(max_bytes, size, count, row)
 

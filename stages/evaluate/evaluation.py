@@ -38,8 +38,8 @@ class EvaluationView:
         pixels: [H, W, 3] uint8, sRGB.
         mask: [H, W], as in `scene.Photo`; None where all pixels count.
         outside: what is outside the mask, as in `scene.Photo`.
-        saturated: [H, W] pixels with a channel too bright to be measured, which are not compared;
-            None where there are none.
+        excluded: [H, W] further pixels that are not compared, as those with a channel too bright
+            to be measured; None where there are none.
     """
 
     name: str
@@ -47,7 +47,7 @@ class EvaluationView:
     pixels: NDArray[np.uint8]
     mask: NDArray[np.uint8] | None = None
     outside: str = ""
-    saturated: NDArray[np.bool_] | None = None
+    excluded: NDArray[np.bool_] | None = None
 
     @property
     def image(self) -> NDArray[np.float32]:
@@ -58,9 +58,14 @@ class EvaluationView:
     def valid(self) -> NDArray[np.bool_] | None:
         """[H, W] the pixels that are compared, or None for all."""
         valid = self.mask > 0 if self.mask is not None and self.outside == IGNORE else None
-        if self.saturated is None:
+        if self.excluded is None:
             return valid
-        return ~self.saturated if valid is None else valid & ~self.saturated
+        return ~self.excluded if valid is None else valid & ~self.excluded
+
+    @property
+    def counts(self) -> bool:
+        """Whether any pixel is compared."""
+        return self.valid is None or bool(self.valid.any())
 
     def in_median_light(self, light: Light | None) -> EvaluationView:
         """With the exposure and white balance of the median photograph; see `scene.light`."""
@@ -71,7 +76,16 @@ class EvaluationView:
         solid = np.float32(1) if alpha is None else alpha[..., None] * np.float32(1 / 255)
         even = (self.image - offsets * solid) / gains
         pixels = np.rint(even * 255).clip(0, 255).astype(np.uint8)
-        return replace(self, pixels=pixels, saturated=np.asarray((self.image >= BRIGHT).any(2)))
+        return replace(self, pixels=pixels, excluded=np.asarray((self.image >= BRIGHT).any(2)))
+
+    def compared_within(self, valid: NDArray[np.bool_] | None) -> EvaluationView:
+        """The same, where only pixels of `valid` [h, w] are compared; at another size, those of
+        which all that they cover is valid. None: all."""
+        if valid is None:
+            return self
+        height, width = self.pixels.shape[:2]
+        outside = np.asarray(scaled_image((~valid).astype(np.float32), width, height) > 0)
+        return replace(self, excluded=outside if self.excluded is None else self.excluded | outside)
 
     def scaled(self, scale: float) -> EvaluationView:
         """At `scale` (at most 1) times the size along each side, by area averaging as in
@@ -82,13 +96,13 @@ class EvaluationView:
             *(max(1, round(scale * side)) for side in (self.camera.width, self.camera.height))
         )
         size = camera.width, camera.height
-        mask, saturated = self.mask, self.saturated
+        mask, excluded = self.mask, self.excluded
         if mask is not None:
             mask = scaled_mask(mask, *size, self.outside)
-        if saturated is not None:
-            saturated = scaled_image(saturated.astype(np.float32), *size) > 0
+        if excluded is not None:
+            excluded = scaled_image(excluded.astype(np.float32), *size) > 0
         pixels = np.rint(scaled_image(self.image, *size) * 255).astype(np.uint8)
-        return replace(self, camera=camera, pixels=pixels, mask=mask, saturated=saturated)
+        return replace(self, camera=camera, pixels=pixels, mask=mask, excluded=excluded)
 
     def over(self, grey: float) -> EvaluationView:
         """Composited over `grey` (0 to 1) instead of black, where it has transparency."""
@@ -102,13 +116,18 @@ class EvaluationView:
 class Score:
     """How near one drawing is to its photograph, by the definitions in `image_metrics`. psnr_db: at
     most `IDENTICAL_DB`. flip: None where it was not computed. inside_db: PSNR inside the mask of a
-    transparent photograph."""
+    transparent photograph. PSNR and SSIM are NaN where no pixel is compared: see `counts`."""
 
     name: str
     psnr_db: float
     ssim: float
     flip: float | None = None
     inside_db: float | None = None
+
+    @property
+    def counts(self) -> bool:
+        """Whether any pixel was compared. Means are of such scores alone."""
+        return not np.isnan(self.psnr_db)
 
 
 class _EvaluationViews(Sequence[EvaluationView]):
@@ -212,13 +231,16 @@ def evaluate_at_sizes(
         with_flip: as in `evaluate`, of the full size.
 
     Returns:
-        The scores of the views by the name of the size.
+        The scores of all views, in their order, by the name of the size.
     """
     scores: dict[str, list[Score]] = {name: [] for name in sizes}
     with_flip_too = evaluation_subset(len(views)) if with_flip and has_flip() else ()
     for number, full in enumerate(views):
         for name, scale in sizes.items():
             view = full.scaled(scale)
+            if not view.counts:
+                scores[name].append(Score(view.name, np.nan, np.nan))
+                continue
             image, truth = np.clip(draw(view.camera), 0.0, 1.0), view.image
             valid = view.valid
             flips = scale == 1 and number in with_flip_too
@@ -243,6 +265,8 @@ def psnr_as_taken_db(
     unadapted, adapted = [], []
     as_taken = replace(draw_settings, light=False)
     for view in load_evaluation_views(folder, views, as_taken):
+        if not view.counts:
+            continue
         image, truth = np.clip(draw(view.camera), 0.0, 1.0), view.image
         half, everywhere = truth.shape[1] // 2, np.ones(truth.shape[:2], bool)
         valid = everywhere if view.valid is None else view.valid
@@ -275,17 +299,22 @@ def image_renderer(splats: Splats, backend: str) -> ImageRenderer:
 def psnr_of_views_db(
     splats: Splats, views: Iterable[EvaluationView], backend: str
 ) -> NDArray[np.float64]:
-    """[V] PSNR of each view, dB."""
+    """[V] PSNR of each view, dB; NaN where no pixel is compared."""
     draw = image_renderer(splats, backend)
-    return np.array([capped_psnr_db(draw(v.camera), v.image, v.valid) for v in views])
+    return np.array(
+        [capped_psnr_db(draw(v.camera), v.image, v.valid) if v.counts else np.nan for v in views]
+    )
 
 
 def mean_psnr_db(
     splats: Splats, views: Iterable[EvaluationView], backend: str, scale: float = 1.0
 ) -> float:
-    """Mean PSNR over the views, each `EvaluationView.scaled`, dB."""
+    """Mean PSNR over the views, each `EvaluationView.scaled`, of which a pixel is compared, dB; 0
+    if there is none."""
     scaled = (view.scaled(scale) for view in views)
-    return float(psnr_of_views_db(splats, scaled, backend).mean())
+    found = psnr_of_views_db(splats, scaled, backend)
+    found = found[~np.isnan(found)]
+    return float(found.mean()) if found.size else 0.0
 
 
 def psnr_name(size: str, stem: str = "psnr") -> str:

@@ -18,10 +18,13 @@ Valid = NDArray[np.bool_] | None
 
 
 def psnr(image: NDArray[np.floating], truth: NDArray[np.floating], valid: Valid = None) -> float:
-    """Peak signal-to-noise ratio in dB over all samples, in float64; inf for equal images."""
+    """Peak signal-to-noise ratio in dB over all samples, in float64; inf for equal images, NaN
+    where no pixel counts."""
     difference = np.asarray(image, np.float64) - np.asarray(truth, np.float64)
     if valid is not None:
         difference = difference[valid]
+    if not difference.size:
+        return math.nan
     mse = float(np.mean(difference * difference))
     return math.inf if mse == 0 else -10.0 * math.log10(mse)
 

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 from stages.base.settings import setting
 from stages.base.stage import Stage, in_module
-from stages.formats.output_formats import DEFAULT_FORMATS, drawing_setting, formats_setting
+from stages.formats.output_formats import (
+    DEFAULT_FORMATS,
+    FIRST_PARTS,
+    drawing_setting,
+    formats_setting,
+)
 from stages.raster.backends import backend_setting
 
 # Every system must take the name, USD's packages too: brackets separate names inside them.
-_NAME = r"(?!assets$)(?![ .])[^/\\:*?\"<>|\[\]\x00-\x1f]{1,100}(?<![ .])"
+_NO_FIRST_PART = rf"(?!(?i:.*\.(?:{'|'.join(map(re.escape, FIRST_PARTS))}))$)"
+_NAME = _NO_FIRST_PART + r"(?!assets$)(?![ .])[^/\\:*?\"<>|\[\]\x00-\x1f]{1,100}(?<![ .])"
 
 
 @dataclass(frozen=True)
@@ -27,7 +34,7 @@ class ExportSettings:
         "Name of the files, without a suffix.",
         pattern=_NAME,
         wanted="A name that every system takes: letters, digits, spaces, - and _; no "
-        "folder, no suffix.",
+        "folder, no suffix, and no end such as .compressed, with which .ply is another format.",
     )
     backend: str = backend_setting()
     drawing: str = drawing_setting()

@@ -13,6 +13,10 @@ DEFAULT_FORMATS = ("ply", "splat", "glb", "usdz")
 LOSSLESS = "ply"
 ALL_MESHES = "mesh"  # a value of `--format`: every format of meshes
 CHOICES = (*FORMATS, ALL_MESHES, *MESHES)
+# A name that ends in one of these, as a.compressed does, forms with an ending another one.
+FIRST_PARTS = tuple(
+    sorted({ending.rpartition(".")[0] for ending in (*FORMATS, *MESHES) if "." in ending})
+)
 
 
 def formats_to_finetune(names: Iterable[str], drawing: str) -> tuple[str, ...]:

@@ -237,11 +237,15 @@ class Pruner:
         return change * (1 + others / max(measured, TINY))
 
     def _planned_rounds(self, splats: Splats) -> int:
-        """As many as the size targets need, and a few more for what they leave."""
-        left = len(splats) - self.targets.excess(splats)
-        if left == len(splats):
+        """As many as the targets need, and a few more for what they leave. Without a size target a
+        PSNR may need as many as remove all, unless no rounds are wanted."""
+        count = len(splats)
+        left = count - self.targets.excess(splats)
+        if self.targets.min_psnr_db and self.rounds:
+            left = min(left, 1)
+        if left >= count:
             return self.rounds
-        needed = math.log(left / len(splats)) / math.log(1 - ROUND_SHARE)
+        needed = math.log(left / count) / math.log(1 - ROUND_SHARE)
         return max(self.rounds, math.ceil(needed) + 4)
 
     def _affordable(

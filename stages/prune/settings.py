@@ -72,7 +72,7 @@ class PruneSettings:
 
 STAGE = Stage(
     "prune",
-    version=27,
+    version=29,
     reads=("sfm", "train"),
     settings_type=PruneSettings,
     **in_module("stages.prune.stage"),

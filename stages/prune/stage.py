@@ -24,6 +24,7 @@ from stages.evaluate.evaluation import (
     mean_psnr_db,
     psnr_of_views_db,
 )
+from stages.evaluate.selection import FEW_VIEWS
 from stages.formats.format_table import FORMATS
 from stages.formats.sog_bits import choose_bits, file_size_bytes
 from stages.prune.rounds import Pruner, PruningResult
@@ -65,11 +66,14 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
         )
         for views in (chosen, [held_out[i] for i in evaluation_subset(len(held_out))])
     )
-    evaluated = evaluated or training
     before_db = psnr_of_views_db(splats, evaluated, backend)
+    if np.isnan(before_db).all():  # no view is held out, or no pixel of one counts
+        evaluated = training
+        before_db = psnr_of_views_db(splats, evaluated, backend)
     pruner = pruner_of(settings, reconstruction, trained, training, backend, report, deadline)
     found = pruner.prune(splats)
     loss_db = before_db - psnr_of_views_db(found.splats, evaluated, backend)
+    before_db, loss_db = (db[~np.isnan(before_db)] for db in (before_db, loss_db))
     report_backend(report, backend)
     report.metric("evaluated_side_px", splats.draw_settings.side)
     mean_db, lost_db = float(before_db.mean()), float(loss_db.mean())
@@ -83,7 +87,9 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     requested = found.forced or settings.min_psnr > 0
     if pruner.targets.broken_by(loss_db) and not requested:
         report.warn("prune-loss-above-limit", describe_loss(loss_db, pruner.targets))
-    if advice := advise_more_splats(found, settings.strength):
+    # of fewer views no splat is seen by enough to be removed, however many there are
+    enough = len(training) >= FEW_VIEWS
+    if enough and (advice := advise_more_splats(found, settings.strength)):
         report.warn("prune-more-would-pay", advice)
     assert np.isfinite(found.splats.means).all()
     save_splats(folder, found.splats)
@@ -123,13 +129,15 @@ def pruner_of(
     """
     extent = training_extent(reconstruction)
     finetuner = FineTuner(training, extent, backend, report, trained.dropout)
+    size_bytes = _size_measure(settings, trained.splats, training, reconstruction)
     targets = Targets(
         strength=settings.strength,
         max_loss_db=settings.max_loss_db,
         max_splats=settings.max_splats,
         max_bytes=settings.max_mb * 1e6,
         min_psnr_db=settings.min_psnr,
-        size_bytes=_size_measure(settings, trained.splats, training, reconstruction),
+        size_bytes=size_bytes,
+        least_bytes=size_bytes(trained.splats.take(slice(1))) if settings.max_mb else 0,
     )
     limits = settings.rounds, settings.finetune_steps
     return Pruner(training, targets, backend, finetuner, *limits, report, deadline)

@@ -28,6 +28,7 @@ class Targets:
         max_loss_db: mean loss of the views, at strength 1.
         max_splats, max_bytes, min_psnr_db: these override the strength; 0 for none.
         size_bytes: gives the size of the file that `max_bytes` is about.
+        least_bytes: its size with one splat.
     """
 
     strength: float
@@ -36,6 +37,7 @@ class Targets:
     max_bytes: float
     min_psnr_db: float
     size_bytes: Callable[[Splats], int]
+    least_bytes: int = 0
 
     def excess(self, splats: Splats) -> int:
         """How many splats are too many for the size targets."""
@@ -43,7 +45,8 @@ class Targets:
         allowed = self.max_splats or count
         size = self.size_bytes(splats) if self.max_bytes else 0
         if size > self.max_bytes:
-            allowed = min(allowed, int(count * self.max_bytes / size))
+            share = max(0, self.max_bytes - self.least_bytes) / max(1, size - self.least_bytes)
+            allowed = min(allowed, 1 + int((count - 1) * share))
         return count - max(1, min(allowed, count))
 
     def allows(self, psnr_db: Psnr, best_db: Psnr) -> bool:

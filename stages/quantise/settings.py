@@ -64,7 +64,7 @@ class QuantiseSettings:
 
 STAGE = Stage(
     "quantise",
-    version=18,
+    version=19,
     reads=("sfm", "train", "prune"),
     settings_type=QuantiseSettings,
     adds="formats",

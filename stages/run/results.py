@@ -11,7 +11,14 @@ from stages.formats import read
 from stages.raster.backends import AUTO, runs_here
 from stages.run import runfolder
 from stages.run.pipeline import Pipeline
-from stages.scene import Reconstruction, Splats, TrainedSplats, View, draw_settings_of
+from stages.scene import (
+    DrawSettings,
+    Reconstruction,
+    Splats,
+    TrainedSplats,
+    View,
+    draw_settings_of,
+)
 
 _STAGES_WITH_SPLATS = ("seed", "train", "prune", "quantise")
 
@@ -72,10 +79,10 @@ def newest_splats(pipeline: Pipeline, antialias: bool = True) -> Splats:
 
 
 def reconstruction_of(pipeline: Pipeline) -> Reconstruction:
-    """The capture's cameras, as training has refined them. Raises SplatError
+    """The capture, with the cameras and masks of training where it has finished. Raises SplatError
     (stage-not-finished)."""
     reconstruction: Reconstruction = pipeline.load("sfm")
-    if pipeline.manifest("train") is None or "train" in out_of_date(pipeline):
+    if not _is_trained(pipeline):
         return reconstruction
     trained: TrainedSplats = pipeline.load("train")
     return reconstruction.with_cameras(trained.cameras).with_masks(trained.masks)
@@ -113,10 +120,11 @@ def exported_formats(pipeline: Pipeline) -> dict[str, dict[str, Any]]:
 
 
 def views_of(pipeline: Pipeline | None) -> tuple[View, ...]:
-    """The capture's views, sorted by name; empty without a finished reconstruction."""
+    """The capture's views, as training has refined them, sorted by name; empty without a finished
+    reconstruction."""
     if pipeline is None or pipeline.manifest("sfm") is None:
         return ()
-    return tuple(sorted(pipeline.load("sfm").views, key=lambda view: view.name))
+    return tuple(sorted(reconstruction_of(pipeline).views, key=lambda view: view.name))
 
 
 def training_side_of(pipeline: Pipeline | None) -> int:
@@ -141,8 +149,22 @@ def read_file(file: Path, strict: bool = True) -> Splats:
     run = run_around(file)
     if run is None or run.manifest("sfm") is None:
         return splats
+    settings = _draw_settings_in(run)
     antialias = splats.draw_settings.antialias  # as the file says
-    return replace(splats, draw_settings=draw_settings_of(run.load("sfm"), antialias=antialias))
+    return replace(splats, draw_settings=replace(settings, antialias=antialias))
+
+
+def _draw_settings_in(pipeline: Pipeline) -> DrawSettings:
+    """Those of training, with its size and correction of light; before it, those of the capture."""
+    if _is_trained(pipeline):
+        trained: TrainedSplats = pipeline.load("train")
+        return trained.splats.draw_settings
+    return draw_settings_of(pipeline.load("sfm"))
+
+
+def _is_trained(pipeline: Pipeline) -> bool:
+    """Whether training has finished with what the run folder holds now."""
+    return pipeline.manifest("train") is not None and "train" not in out_of_date(pipeline)
 
 
 def backend_of_run(pipeline: Pipeline | None) -> str:

@@ -89,7 +89,8 @@ class Comparison:
 
 def compare_runs(first: Candidate, second: Candidate) -> Comparison:
     """Evaluate both on the views that both hold out, at the smaller size of the two, each with its
-    own run's camera. Raises SplatError (compare-nothing-in-common)."""
+    own run's camera, on the pixels that count in both. Views of which at some size no pixel counts
+    are left out. Raises SplatError (compare-nothing-in-common, compare-no-pixels)."""
     training, names = (sorted(a.keys() & b) for a, b in zip(first.split, second.split, strict=True))
     if not names:
         raise UsageError(
@@ -100,17 +101,48 @@ def compare_runs(first: Candidate, second: Candidate) -> Comparison:
         )
     both = (first, second)
     side_px = min(one.side_px(name) for one in both for name in names)
-    names, count = [*names, *evenly_spaced(training, TRAINING_VIEWS)], len(names)
-    views = (first.views(names, side_px), second.views(names, side_px))
+    held_out = _on_common_pixels(both, names, side_px)
+    if not held_out:
+        raise _no_pixels(first, second)
+    seen, count = evenly_spaced(training, TRAINING_VIEWS), len(held_out)
+    pairs = [*held_out, *_on_common_pixels(both, seen, side_px)]
     a, b = (
-        evaluate_at_sizes(image_renderer(one.splats, one.backend), seen)
-        for one, seen in zip(both, views, strict=True)
+        evaluate_at_sizes(image_renderer(one.splats, one.backend), [pair[i] for pair in pairs])
+        for i, one in enumerate(both)
     )
     ssim = change_of(b["full"], a["full"], count, "ssim")
     psnr = {size: change_of(b[size], a[size], count) for size in SIZES}
     a, b = ({size: scores[:count] for size, scores in found.items()} for found in (a, b))
-    views = (views[0][:count], views[1][:count])
+    views = tuple(view for view, _ in held_out), tuple(view for _, view in held_out)
     return Comparison(both, views, (a, b), ssim, psnr, side_px)
+
+
+def _on_common_pixels(
+    both: tuple[Candidate, Candidate], names: Sequence[str], side_px: int
+) -> list[tuple[EvaluationView, EvaluationView]]:
+    """The views `names` of both, compared where both masks are valid: the run with the smaller ones
+    would be better because they leave out what is hard to draw. Without views of which no pixel is
+    compared at some of `SIZES`."""
+    first, second = (one.views(names, side_px) for one in both)
+    pairs = (
+        (a.compared_within(b.valid), b.compared_within(a.valid))
+        for a, b in zip(first, second, strict=True)
+    )
+    return [pair for pair in pairs if all(map(_counts_at_every_size, pair))]
+
+
+def _counts_at_every_size(view: EvaluationView) -> bool:
+    return view.valid is None or all(view.scaled(scale).counts for scale in SIZES.values())
+
+
+def _no_pixels(first: Candidate, second: Candidate) -> UsageError:
+    return UsageError(
+        "compare-no-pixels",
+        given=f"The masks of {first.name} and {second.name} leave no pixel of a held-out "
+        "photograph that counts in both at full, half and quarter size.",
+        wanted="Held-out photographs of which masks keep a part.",
+        hint="Make one of the runs again with larger masks, or without --masks.",
+    )
 
 
 def verdict_lines(comparison: Comparison) -> list[str]:

@@ -94,7 +94,7 @@ class Tradeoff:
 
 
 def mean_db(scores: Sequence[Score]) -> float:
-    return float(np.mean([score.psnr_db for score in scores]))
+    return float(np.mean([score.psnr_db for score in scores if score.counts]))
 
 
 def change_of(
@@ -102,9 +102,12 @@ def change_of(
 ) -> Difference:
     """Of one `figure` of the same views in the same order: so many held-out ones, then training
     views."""
-    pairs = zip(scores, baseline, strict=True)
-    changes = [getattr(a, figure) - getattr(b, figure) for a, b in pairs]
-    return paired_difference(changes[:held_out], changes[held_out:])
+    pairs = list(zip(scores, baseline, strict=True))
+    unseen, seen = (
+        [getattr(a, figure) - getattr(b, figure) for a, b in part if a.counts and b.counts]
+        for part in (pairs[:held_out], pairs[held_out:])
+    )
+    return paired_difference(unseen, seen)
 
 
 def time_to(history: Sequence[HistoryPoint], below_db: float) -> tuple[float, float]:

@@ -77,7 +77,7 @@ def measure_tradeoff(inputs: TradeoffInputs, progress: ProgressCallback) -> Trad
         history=_history(inputs.history),
         formats=_formats(inputs, own_scores, progress),
         pruned=(own, *_pruned(inputs, own_scores, progress)),
-        scores=tuple(own_scores[: len(inputs.held_out)]),
+        scores=tuple(score for score in own_scores[: len(inputs.held_out)] if score.counts),
         side_px=max(max(view.pixels.shape[:2]) for view in inputs.held_out),
         coverage=coverage,
         exported=inputs.exported,

@@ -18,7 +18,7 @@ from stages.tradeoff.curves import Coverage, OperatingPoint, Tradeoff, time_to
 from stages.tradeoff.intervals import OTHER_VIEWS, Difference
 
 SMALL_LOSS_DB = 0.1  # that few people would see
-NO_TIMES = "Training logged no times (an older version trained this run). Run `splat train` again."
+NO_COURSE = "Training logged no course: it made no steps or few, or trained in blocks."
 FINE_TUNED = (
     "The rest was fine-tuned after each removal, as `splat prune --max-splats` does. Training with "
     "so few splats from the start may lose less."
@@ -35,7 +35,7 @@ def about_time(tradeoff: Tradeoff) -> list[str]:
     """How soon training came near its last PSNR, and what the second half of the time gained."""
     history = tradeoff.history
     if len(history) < 2:
-        return [NO_TIMES]
+        return [NO_COURSE]
     last = history[-1]
     lines = [
         f"Training reached {last.psnr_db:.2f} dB after {_seconds(last.cpu_seconds)} of CPU time "

@@ -24,15 +24,17 @@ ERROR_GAIN = 4.0
 
 def contact_sheet(
     path: Path,
-    rows: Sequence[tuple[str, Sequence[float], NDArray[np.float32], NDArray[np.float32]]],
+    rows: Sequence[tuple[str, Sequence[float | None], NDArray[np.float32], NDArray[np.float32]]],
 ) -> None:
-    """A PNG with a numbered row for each (name, PSNR in dB at each of `SIZES`, render,
+    """A PNG with a numbered row for each (name, PSNR in dB at each of `SIZES` or None, render,
     photograph): photograph, render, absolute error x 4; and a .txt beside it that says which number
     is which photograph, since the picture's font knows only ASCII."""
     strips, legend = [], []
     for number, (name, decibels, image, truth) in enumerate(rows, 1):
         figures = ", ".join(
-            f"{size} size {psnr:.2f} dB" for size, psnr in zip(SIZES, decibels, strict=True)
+            f"{size} size {psnr:.2f} dB"
+            for size, psnr in zip(SIZES, decibels, strict=True)
+            if psnr is not None
         )
         legend.append(f"{number}  {name}  {figures}\n")
         error = np.clip(np.abs(image - truth) * ERROR_GAIN, 0, 1)

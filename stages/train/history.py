@@ -39,6 +39,7 @@ class History:
     def add(self, step: int, splats: int, scores: Sequence[Score], elapsed: Elapsed) -> None:
         """Enter an evaluation on the held-out views, which gave `scores`."""
         psnr_db = ssim = None
+        scores = [score for score in scores if score.counts]
         if scores:
             psnr_db = float(np.mean([score.psnr_db for score in scores]))
             ssim = float(np.mean([score.ssim for score in scores]))

@@ -47,14 +47,14 @@ def write_quality(
     """
     by_size = evaluate_at_sizes(render, views, with_flip=True)
     scores = by_size["full"]
-    if scores:
+    measured = [i for i, score in enumerate(scores) if score.counts]
+    if measured:
         _report_scores(by_size, report)
     else:
-        report.warn(
-            "train-nothing-held-out",
-            "Too few photographs to hold one out: quality was not measured.",
-        )
-    if draw_settings.light and scores:
+        few = "Too few photographs to hold one out"
+        cause = "Masks leave nothing of the held-out photographs" if scores else few
+        report.warn("train-nothing-held-out", f"{cause}: quality was not measured.")
+    if draw_settings.light and measured:
         _, held = split_held_out(reconstruction.views)
         unadapted, adapted = psnr_as_taken_db(render, reconstruction.folder, held, draw_settings)
         report.metric("psnr_as_taken_db", round(unadapted, 3))
@@ -62,16 +62,19 @@ def write_quality(
     if inside := [score.inside_db for score in scores if score.inside_db is not None]:
         report.metric("psnr_inside_db", round(float(np.mean(inside)), 3))
     figures = [
-        {psnr_name(name): score.psnr_db for name, score in zip(by_size, same, strict=True)}
+        {
+            psnr_name(name): score.psnr_db if score.counts else None
+            for name, score in zip(by_size, same, strict=True)
+        }
         for same in zip(*by_size.values(), strict=True)
     ]
     held_out = [asdict(score) | more for score, more in zip(scores, figures, strict=True)]
-    report.metric("held_out", held_out)
+    report.metric("held_out", [one for one in held_out if one["psnr_db"] is not None])
     sides = (max(view.pixels.shape[:2]) for view in views)
     report.metric("evaluated_side_px", max(sides, default=0))
     rows = []
-    worst = min(range(len(scores)), key=lambda i: scores[i].psnr_db, default=0)
-    for i in sorted({*evaluation_subset(len(scores)), worst}) if scores else ():
+    worst = sorted(measured, key=lambda i: scores[i].psnr_db)[:1]
+    for i in sorted({*(measured[k] for k in evaluation_subset(len(measured))), *worst}):
         image = np.clip(render(views[i].camera), 0.0, 1.0)
         rows.append((views[i].name, list(figures[i].values()), image, views[i].image))
     contact_sheet(folder / "held_out.png", rows)
@@ -117,12 +120,12 @@ def write_history(history: History, folder: Path, report: Report) -> None:
 
 
 def _report_scores(by_size: Mapping[str, Sequence[Score]], report: Report) -> None:
-    scores = by_size["full"]
+    scores = [score for score in by_size["full"] if score.counts]
     worst = min(scores, key=lambda score: score.psnr_db)
     flips = [score.flip for score in scores if score.flip is not None]
     for name, same in by_size.items():
-        mean = float(np.mean([score.psnr_db for score in same]))
-        report.metric(psnr_name(name), round(mean, 3))
+        if found := [score.psnr_db for score in same if score.counts]:
+            report.metric(psnr_name(name), round(float(np.mean(found)), 3))
     report.metric("psnr_worst_db", round(worst.psnr_db, 3))
     report.metric("psnr_worst_view", worst.name)
     report.metric("ssim", round(float(np.mean([score.ssim for score in scores])), 4))

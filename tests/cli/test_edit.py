@@ -126,6 +126,24 @@ def test_a_file_is_at_most_as_large_as_max_mb(source: Path, tmp_path: Path) -> N
     assert not (tmp_path / "c.ply").exists()
 
 
+@pytest.mark.parametrize("count", [1, 20, 3000])
+def test_a_size_that_is_mostly_the_page_is_met(source: Path, tmp_path: Path, count: int) -> None:
+    formats.write(source, many_splats(5000))
+    formats.write(tmp_path / "few.html", many_splats(count))
+    wanted = 1.001 * (tmp_path / "few.html").stat().st_size
+    edited(source, tmp_path / "b.html", "--max-mb", wanted / 1e6)
+    assert (tmp_path / "b.html").stat().st_size <= wanted
+    assert len(result_of(tmp_path / "b.html")) > 0.75 * count
+
+
+def test_the_last_decimation_to_a_size_is_measured(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(operations, "_ATTEMPTS", 1)
+    edited(source, tmp_path / "b.ply", "--max-mb", "0.02")
+    assert (tmp_path / "b.ply").stat().st_size <= 20_000
+
+
 def test_a_size_that_one_splat_exceeds_is_refused_at_once(
     source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +21,8 @@ from stages.evaluate.evaluation import (
     evaluation_subset,
     image_renderer,
     load_evaluation_views,
+    mean_psnr_db,
+    psnr_of_views_db,
 )
 from stages.evaluate.image_metrics import IDENTICAL_DB, capped_psnr_db, flip
 from stages.raster.draw import raster_settings_of
@@ -33,7 +36,7 @@ from stages.scene import (
     View,
     draw_settings_of,
 )
-from stages.train.quality import _report_scores
+from stages.train.quality import _report_scores, write_quality
 from tests.scenes import BACKENDS, join, splats
 from tests.small_scene import SmallScene, small_scene
 
@@ -113,12 +116,27 @@ def test_a_scaled_view_is_the_photograph_at_that_size(scene: SmallScene) -> None
 
 def test_a_pixel_counts_at_a_smaller_size_if_all_that_it_averages_counts() -> None:
     camera = Camera(8, 8, 10.0, 10.0, 4.0, 4.0, np.eye(4))
-    mask, saturated = np.full((8, 8), 255, np.uint8), np.zeros((8, 8), bool)
-    mask[0, 1], saturated[7, 7] = 0, True
-    view = EvaluationView("a", camera, np.zeros((8, 8, 3), np.uint8), mask, IGNORE, saturated)
+    mask, excluded = np.full((8, 8), 255, np.uint8), np.zeros((8, 8), bool)
+    mask[0, 1], excluded[7, 7] = 0, True
+    view = EvaluationView("a", camera, np.zeros((8, 8, 3), np.uint8), mask, IGNORE, excluded)
     wanted = np.ones((4, 4), bool)
     wanted[0, 0] = wanted[3, 3] = False
     np.testing.assert_array_equal(view.scaled(0.5).valid, wanted)
+
+
+def test_views_of_two_sizes_are_compared_on_pixels_that_are_valid_in_both() -> None:
+    camera = Camera(4, 4, 5.0, 5.0, 2.0, 2.0, np.eye(4))
+    view = EvaluationView("a", camera, np.zeros((4, 4, 3), np.uint8))
+    assert view.compared_within(None).valid is None
+    valid = np.ones((8, 8), bool)
+    valid[0, 1] = False
+    wanted = np.ones((4, 4), bool)
+    wanted[0, 0] = False
+    first = view.compared_within(valid)
+    np.testing.assert_array_equal(first.valid, wanted)
+    second = np.ones((4, 4), bool)
+    second[3, 3] = wanted[3, 3] = False
+    np.testing.assert_array_equal(first.compared_within(second).valid, wanted)
 
 
 def test_an_evaluation_at_sizes_draws_each_size_and_begins_with_the_full_one(
@@ -133,6 +151,64 @@ def test_an_evaluation_at_sizes_draws_each_size_and_begins_with_the_full_one(
     assert found["full"] == evaluate(draw, views, with_flip=True)
     for name, scale in (("half", 0.5), ("quarter", 0.25)):
         assert found[name] == evaluate(draw, [view.scaled(scale) for view in views])
+
+
+def with_sparse_masks(scene: SmallScene, folder: Path) -> Sequence[EvaluationView]:
+    """The views, of which masks leave nothing of the first, and no pixel of the second that all
+    those of a smaller picture lie around."""
+    nothing, stripes = np.zeros((54, 72), np.uint8), np.zeros((54, 72), np.uint8)
+    stripes[:, ::2] = 255
+    first, second, *others = scene.reconstruction.views
+    for name, mask in (("nothing.png", nothing), ("stripes.png", stripes)):
+        Image.fromarray(mask).save(folder / name)
+    masked = (
+        replace(first, mask=str(folder / "nothing.png"), outside=IGNORE),
+        replace(second, mask=str(folder / "stripes.png"), outside=IGNORE),
+    )
+    settings = scene.splats.draw_settings
+    return load_evaluation_views(scene.reconstruction.folder, (*masked, *others), settings)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_view_without_a_pixel_that_counts_is_in_no_mean(
+    scene: SmallScene, tmp_path: Path
+) -> None:
+    views = with_sparse_masks(scene, tmp_path)
+    found = evaluate_at_sizes(image_renderer(scene.splats, "cpu"), views)
+    counts = {name: [score.counts for score in scores] for name, scores in found.items()}
+    assert counts == {
+        "full": [False, True, True, True, True],
+        "half": [False, False, True, True, True],
+        "quarter": [False, False, True, True, True],
+    }
+    of_views = psnr_of_views_db(scene.splats, views, "cpu")
+    assert np.isnan(of_views).tolist() == [True, False, False, False, False]
+    for scale, first in ((1.0, 1), (0.5, 2), (0.25, 2)):
+        mean = mean_psnr_db(scene.splats, views, "cpu", scale)
+        assert mean == mean_psnr_db(scene.splats, views[first:], "cpu", scale)
+    report, reconstruction = Report(), scene.reconstruction
+    settings = scene.splats.draw_settings
+    draw = image_renderer(scene.splats, "cpu")
+    write_quality(draw, views, settings, reconstruction, tmp_path, report)
+    names = [view.name for view in reconstruction.views]
+    assert [score["name"] for score in report.metrics["held_out"]] == names[1:]
+    assert report.metrics["psnr_half_db"] > 20
+    assert report.metrics["psnr_worst_db"] > 20
+    assert not report.warnings
+
+
+def test_where_masks_leave_nothing_quality_is_not_measured(
+    scene: SmallScene, tmp_path: Path
+) -> None:
+    views, report = with_sparse_masks(scene, tmp_path)[:1], Report()
+    assert mean_psnr_db(scene.splats, views, "cpu") == 0
+    settings = scene.splats.draw_settings
+    draw = image_renderer(scene.splats, "cpu")
+    write_quality(draw, views, settings, scene.reconstruction, tmp_path, report)
+    [(code, message)] = report.warnings
+    assert code == "train-nothing-held-out"
+    assert "Masks" in message
+    assert "psnr_db" not in report.metrics
 
 
 def test_a_python_without_flip_evaluates_without_it(

@@ -17,6 +17,7 @@ from stages.export import stage as export
 from stages.export.settings import ExportSettings
 from stages.formats import FORMATS
 from stages.formats import mesh_files as files
+from stages.formats.mesh_table import MESHES
 from stages.mesh import fuse
 from stages.proof import checks
 from stages.proof.content import FileContent
@@ -241,6 +242,25 @@ def test_a_name_that_is_no_file_name_is_refused(name: str) -> None:
     with pytest.raises(SplatError) as caught:
         check_settings(ExportSettings(name=name))
     assert caught.value.family == Family.USAGE
+
+
+@pytest.mark.parametrize("part", ["compressed", "Mesh", "quantised", "spz", "v4"])
+def test_a_name_that_makes_another_format_is_refused(part: str) -> None:
+    with pytest.raises(SplatError, match="another format"):
+        check_settings(ExportSettings(name=f"a.{part}"))
+    check_settings(ExportSettings(name=part))
+    check_settings(ExportSettings(name=f"a.{part}-b"))
+
+
+@pytest.mark.parametrize("ending", FORMATS)
+def test_every_name_that_is_taken_keeps_the_format_that_was_requested(ending: str) -> None:
+    parts = {part for each in (*FORMATS, *MESHES) for part in each.split(".")}
+    for stem in ("scene", *parts, *(f"a.{part}" for part in parts)):
+        try:
+            check_settings(ExportSettings(name=stem))
+        except SplatError:
+            continue
+        assert formats.format_of(Path(f"{stem}.{ending}")).ending == ending
 
 
 def test_a_name_with_spaces_and_accents_is_fine(scene: SmallScene, tmp_path: Path) -> None:

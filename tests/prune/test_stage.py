@@ -181,11 +181,40 @@ def test_held_out_views_that_lose_more_are_in_a_warning(scene, tmp_path) -> None
     assert [code for code, _ in report.warnings] == ["prune-loss-above-limit"]
 
 
+@pytest.mark.parametrize(("count", "advised"), [(1, False), (2, False), (3, True)])
+def test_more_splats_are_not_advised_where_too_few_views_decide(
+    tmp_path, count: int, advised: bool
+) -> None:
+    scene = small_scene(tmp_path, n=60)  # of which each tenth is needed
+    few = replace(scene.reconstruction, views=scene.reconstruction.views[:count])
+    _, report = run(replace(scene, reconstruction=few), scene.splats, tmp_path)
+    assert ("prune-more-would-pay" in dict(report.warnings)) == advised
+
+
 def test_at_low_strength_nothing_is_removed_that_the_views_show(scene, tmp_path) -> None:
     result, report = run(scene, scene.splats, tmp_path, strength=0.001, max_loss_db=100)
     assert report.metrics["stopped_by"] == "rate_distortion"
     assert training_db(scene, result) >= training_db(scene, scene.splats) - 0.02
     assert len(result) > 0.8 * len(scene.splats)
+
+
+def test_held_out_views_without_a_pixel_that_counts_are_in_no_figure(scene, tmp_path) -> None:
+    """Masks leave nothing of one held-out view of two, or of both."""
+    Image.fromarray(np.zeros((54, 72), np.uint8)).save(tmp_path / "nothing.png")
+    held_out = split_held_out(scene.reconstruction.views)[1]
+    figures = []
+    for names in ([held_out[0].name], [view.name for view in held_out]):
+        views = tuple(
+            replace(view, mask=str(tmp_path / "nothing.png"), outside=IGNORE)
+            if view.name in names
+            else view
+            for view in scene.reconstruction.views
+        )
+        masked = replace(scene, reconstruction=replace(scene.reconstruction, views=views))
+        _, report = run(masked, scene.splats, tmp_path)
+        figures.append([v for name, v in report.metrics.items() if name.startswith("psnr_")])
+    assert np.isfinite(figures).all()
+    assert min(before for before, *_ in figures) > 30
 
 
 def test_the_loss_of_a_round_is_predicted(scene, tmp_path) -> None:
@@ -224,6 +253,19 @@ def test_a_size_in_megabytes_is_met_from_below(scene, tmp_path) -> None:
     assert 0.95 * 16_000 < path.stat().st_size <= 16_000
 
 
+@pytest.mark.parametrize("kept", [1, 20, 150])
+def test_a_size_that_is_mostly_the_page_is_met(scene, tmp_path, kept: int) -> None:
+    reconstruction = scene.reconstruction
+    known = {"units": reconstruction.units, "views": reconstruction.views}
+    path = tmp_path / "scene.html"
+    formats.write(path, scene.splats.take(slice(kept)), **known)
+    wanted = 1.001 * path.stat().st_size
+    result, _ = run(scene, scene.splats, tmp_path, max_mb=wanted / 1e6, mb_of="html")
+    formats.write(path, result, **known)
+    assert path.stat().st_size <= wanted
+    assert len(result) > 0.8 * kept
+
+
 def test_a_round_that_is_predicted_to_cost_too_much_is_not_measured(
     scene, tmp_path, monkeypatch
 ) -> None:
@@ -240,11 +282,18 @@ def test_a_round_that_is_predicted_to_cost_too_much_is_not_measured(
     assert len(measured) == 1  # before the first round
 
 
-def test_a_psnr_is_met_and_no_better_than_needed(scene, tmp_path) -> None:
-    wanted = training_db(scene, scene.splats) - 3
-    result, _ = run(scene, scene.splats, tmp_path, min_psnr=wanted, rounds=40)
+@pytest.mark.parametrize("lower_db", [3, 18])
+def test_a_psnr_is_met_and_no_better_than_needed(scene, tmp_path, lower_db: int) -> None:
+    wanted = training_db(scene, scene.splats) - lower_db  # the second needs many rounds
+    result, report = run(scene, scene.splats, tmp_path, min_psnr=wanted)
     assert wanted <= training_db(scene, result) < wanted + 0.5
     assert len(result) < len(scene.splats)
+    assert report.metrics["stopped_by"] == "loss"
+
+
+def test_a_psnr_with_no_rounds_removes_nothing(scene, tmp_path) -> None:
+    result, _ = run(scene, scene.splats, tmp_path, min_psnr=10, rounds=0)
+    assert len(result) == len(scene.splats)
 
 
 @pytest.mark.parametrize(

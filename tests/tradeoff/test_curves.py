@@ -74,7 +74,10 @@ def test_a_run_without_a_log_says_so(logged):
     own = OperatingPoint("as it is", 100, 20.0, paired_difference([0.0] * 3, []))
     course = tuple(history(20.0)[:logged])
     tradeoff = Tradeoff(own, course, (), (own,), (), 480, empty_coverage())
-    assert report_text.about_time(tradeoff) == [report_text.NO_TIMES]
+    assert report_text.about_time(tradeoff) == [report_text.NO_COURSE]
+    for cause in ("no steps or few", "in blocks"):
+        assert cause in report_text.NO_COURSE
+    assert "splat train" not in report_text.NO_COURSE  # which would log no more
 
 
 def test_a_single_view_has_an_interval_where_training_views_say_how_far_views_differ() -> None:

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from stages.base.errors import SplatError
 from stages.base.stage import Report
@@ -16,6 +17,7 @@ from stages.formats import FORMATS
 from stages.prune.settings import PruneSettings
 from stages.prune.stage import pruner_of
 from stages.scene import (
+    IGNORE,
     DrawSettings,
     QuantisedSplats,
     TrainedSplats,
@@ -195,7 +197,7 @@ def test_a_run_without_a_log_gets_the_other_curves(inputs, tmp_path) -> None:
     tradeoff = measure_tradeoff(replace(inputs, history=()), lambda label: None)
     files = write_report(tmp_path, "scene", tradeoff, inputs)
     assert "time.png" not in {file.name for file in files}
-    assert report_text.NO_TIMES in (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert report_text.NO_COURSE in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow
@@ -252,6 +254,71 @@ def test_a_comparison_says_which_run_is_better_at_each_size(scene) -> None:
     assert [row[0] for row in fact_rows(found)][:3] == [
         f"held-out PSNR, {size} size" for size in ("full", "half", "quarter")
     ]
+
+
+def masked(scene, candidate: Candidate, name: str, mask: np.ndarray) -> Candidate:
+    """A run whose views ignore what is outside `mask`, a file of this name."""
+    reconstruction = scene.reconstruction
+    Image.fromarray(np.where(mask, 255, 0).astype(np.uint8)).save(reconstruction.folder / name)
+    views = (replace(view, mask=name, outside=IGNORE) for view in reconstruction.views)
+    return replace(candidate, reconstruction=replace(reconstruction, views=tuple(views)))
+
+
+def test_a_run_is_not_better_for_ignoring_what_it_draws_wrong(scene) -> None:
+    middle = np.zeros((54, 72), bool)
+    middle[10:44, 16:56] = True
+    inside = (np.abs(scene.splats.means) < 0.35).all(1)
+    sh = scene.splats.sh.copy()
+    sh[inside] += np.float32(0.3)
+    wrong = side(scene, "wrong", replace(scene.splats, sh=sh))
+    brighter = replace(scene.splats, sh=scene.splats.sh + np.float32(0.02))
+    first, second = side(scene, "first", brighter), masked(scene, wrong, "outer.png", ~middle)
+    found = compare_runs(first, second)
+    equal = compare_runs(masked(scene, first, "outer.png", ~middle), second)
+    assert found.psnr == equal.psnr
+    assert {size: d.mean for size, d in found.psnr_by_size.items()} == {
+        size: d.mean for size, d in equal.psnr_by_size.items()
+    }
+    assert found.ssim == equal.ssim
+
+
+def held_out_masked(scene, candidate: Candidate, names: list[str], mask: np.ndarray) -> Candidate:
+    """A run in which views of these names ignore what is outside `mask`."""
+    reconstruction = scene.reconstruction
+    everywhere = masked(scene, candidate, "held_out.png", mask).reconstruction.views
+    views = [
+        one if one.name in names else view
+        for one, view in zip(everywhere, reconstruction.views, strict=True)
+    ]
+    return replace(candidate, reconstruction=replace(reconstruction, views=tuple(views)))
+
+
+@pytest.mark.parametrize("share", [0, 1 / 2])  # of the columns, every other one
+def test_a_view_without_a_pixel_that_counts_is_not_compared(scene, share: float) -> None:
+    names = [view.name for view in split_held_out(scene.reconstruction.views)[1]]
+    assert len(names) == 2
+    mask = np.zeros((54, 72), bool)
+    mask[:, ::2] = share > 0
+    fewer = side(scene, "fewer", scene.splats.take(slice(0, 120)))
+    found = compare_runs(side(scene, "all"), held_out_masked(scene, fewer, names[:1], mask))
+    assert found.psnr.views == 1
+    assert [view.name for view in found.views[0]] == names[1:]
+    assert [score.name for score in found.scores[1]] == names[1:]
+    with pytest.raises(SplatError) as error:
+        compare_runs(side(scene, "all"), held_out_masked(scene, fewer, names, mask))
+    assert error.value.code == "compare-no-pixels"
+
+
+def test_a_view_without_a_pixel_that_counts_is_in_no_operating_point(scene, inputs) -> None:
+    few = replace(inputs, prune_to=None, held_out=list(inputs.held_out))
+    nothing = np.zeros((54, 72), np.uint8)
+    few.held_out[0] = replace(few.held_out[0], mask=nothing, outside=IGNORE)
+    first, second = (
+        measure_tradeoff(one, lambda label: None)
+        for one in (few, replace(few, held_out=few.held_out[1:]))
+    )
+    assert first.own == second.own
+    assert first.scores == second.scores
 
 
 def test_both_are_compared_at_the_smaller_size(scene) -> None:
