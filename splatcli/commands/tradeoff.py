@@ -62,6 +62,11 @@ def tradeoff(
     console.out.print(str(files[0]), markup=False)
 
 
+def _nothing_held_out(given: str, hint: str) -> UsageError:
+    wanted = "A run with photographs that training did not use, to measure quality on."
+    return UsageError("nothing-held-out", given=given, wanted=wanted, hint=hint)
+
+
 def _inputs(pipeline: Pipeline) -> TradeoffInputs:
     """The splats, views and files to measure, of a finished run. Raises SplatError
     (stage-not-finished, run-half-anew, nothing-held-out)."""
@@ -70,11 +75,15 @@ def _inputs(pipeline: Pipeline) -> TradeoffInputs:
     reconstruction = results.reconstruction_of(pipeline)
     training, held = split_held_out(reconstruction.views)
     if not held:
-        raise UsageError(
-            "nothing-held-out",
-            given=f"{pipeline.run_folder} has no held-out view: there are too few photographs.",
-            wanted="A run with photographs that training did not use, to measure quality on.",
-            hint="Take more photographs: at least four; one of every eight is held out.",
+        raise _nothing_held_out(
+            f"{pipeline.run_folder} has no held-out view: there are too few photographs.",
+            "Take more photographs: at least four; one of every eight is held out.",
+        )
+    held_out = load_evaluation_views(reconstruction.folder, held, settings)
+    if not any(view.counts for view in held_out):
+        raise _nothing_held_out(
+            f"Masks leave nothing of the held-out photographs of {pipeline.run_folder}.",
+            "Make the run again with masks that leave more, or without --masks.",
         )
     manifest = pipeline.manifest("train")
     views = load_evaluation_views(reconstruction.folder, training, settings)
@@ -90,7 +99,7 @@ def _inputs(pipeline: Pipeline) -> TradeoffInputs:
 
     return TradeoffInputs(
         splats=splats,
-        held_out=load_evaluation_views(reconstruction.folder, held, settings),
+        held_out=held_out,
         training=evenly_spaced(views, TRAINING_VIEWS),
         views=reconstruction.views,
         units=reconstruction.units,

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from stages.base.stage import Report, Stage
+from stages.evaluate.evaluation import EvaluationView
 from stages.run import pipeline
 from stages.run.stages import STAGES
 from stages.scene.storage import save_splats
@@ -83,6 +84,16 @@ def test_a_run_without_held_out_photographs_is_reported(splat: Splat, views) -> 
     views["count"] = 3
     made(splat, "run")
     assert failed(splat("tradeoff", "run", "--json")) == "nothing-held-out"
+
+
+def test_held_out_photographs_of_which_masks_leave_nothing_are_reported(
+    splat: Splat, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made(splat, "run")
+    monkeypatch.setattr(EvaluationView, "counts", False)
+    result = splat("tradeoff", "run", "--json")
+    assert failed(result) == "nothing-held-out"
+    assert "Masks leave nothing" in result.stdout
 
 
 def test_an_unfinished_run_is_reported(splat: Splat) -> None:
