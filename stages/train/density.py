@@ -28,7 +28,7 @@ CHILD_LENGTH, CHILD_WIDTH = 0.7, 0.9
 CHILD_OPACITY = 0.7
 GRADIENT_THRESHOLD = 2e-4  # of the mean gradient by the 2D position, as published
 # In longer runs learning rates are lower, and mean gradients smaller: see `gradient_threshold`.
-LONG_RUN = 7000  # steps
+LONG_RUN = 2400  # steps
 # Splats that fewer views see are densified last: floaters are among them.
 ENOUGH_VIEWS = 4.0
 MIN_OPACITY = 0.005
@@ -37,7 +37,7 @@ MIN_OPACITY = 0.005
 def gradient_threshold(steps: int) -> float:
     """The threshold of a run of `steps`. It falls as 1 / sqrt(steps) in long ones: otherwise 30,000
     steps grow fewer splats than 7,000, and end with a lower PSNR
-    (docs/experiments/densification.md)."""
+    (docs/experiments/densification.md#a-lower-threshold)."""
     return GRADIENT_THRESHOLD * math.sqrt(min(1.0, LONG_RUN / steps))
 
 

@@ -116,8 +116,8 @@ def test_splats_that_one_view_sees_are_densified_last_even_with_larger_gradients
 
 
 def test_the_threshold_is_the_published_one_and_falls_with_the_root_of_a_long_runs_steps():
-    assert {gradient_threshold(steps) for steps in (1, 2000, 7000)} == {GRADIENT_THRESHOLD}
-    assert gradient_threshold(28_000) == pytest.approx(GRADIENT_THRESHOLD / 2)
+    assert {gradient_threshold(steps) for steps in (1, 2000, 2400)} == {GRADIENT_THRESHOLD}
+    assert gradient_threshold(9600) == pytest.approx(GRADIENT_THRESHOLD / 2)
 
 
 def test_the_cap_takes_half_of_the_free_memory():
