@@ -19,6 +19,7 @@ _DISTANCE = 2.2  # in radii of the densest part
 _CONE = 0.35  # half width of what must be free, as part of the distance
 _FREE = 0.05  # part of that width's area that a side must be freer by
 _LENS = 0.8  # focal length in widths
+_NO_SIZE = 1e-3  # world units, for the size of a single point
 
 
 def first_camera(splats: Splats) -> Camera:
@@ -61,13 +62,13 @@ def _densest_part(means: NDArray[np.float64]) -> tuple[NDArray[np.float64], floa
     """(centre [3], radius) of a ball that holds a third of the means: the median of those nearest
     to the median, of fewer and fewer."""
     if not len(means):
-        return np.zeros(3), 1e-3
+        return np.zeros(3), _NO_SIZE
     centre = np.median(means, axis=0)
     for share in (0.8, 0.6, 0.45, 1 / 3):
         away = np.linalg.norm(means - centre, axis=1)
         centre = np.median(means[away <= np.quantile(away, share)], axis=0)
     away = np.linalg.norm(means - centre, axis=1)
-    return centre, max(float(np.quantile(away, 1 / 3)), 1e-3)
+    return centre, float(np.quantile(away, 1 / 3)) or _NO_SIZE
 
 
 def orbit_cameras(splats: Splats, count: int, part: float) -> tuple[Camera, ...]:
@@ -75,7 +76,7 @@ def orbit_cameras(splats: Splats, count: int, part: float) -> tuple[Camera, ...]
     first is in front; each sees all of that part."""
     low, high = quantiles(splats.means, (0.5 - part / 2, 0.5 + part / 2))
     middle = (low + high) / 2
-    distance = max(float(np.linalg.norm(high - low)), 1e-3) * 1.2
+    distance = (float(np.linalg.norm(high - low)) or _NO_SIZE) * 1.2
     width = _WIDTH_PX
     height = width * 3 // 4
     cameras = []
@@ -90,7 +91,7 @@ def median_depth(camera: Camera, means: NDArray[np.floating]) -> float:
     """The median z of the means inside the picture; of all in front of the camera if none is."""
     points = means[:: max(1, len(means) // _MEANS_FOR_DEPTH)].astype(np.float64)
     pixels, z = camera.project(points)
-    ahead = z > 0.01
+    ahead = z > 0
     inside = ahead & camera.shows(pixels)
     for chosen in (inside, ahead):
         if chosen.any():

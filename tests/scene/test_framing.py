@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from stages.raster.draw import render
-from stages.scene import Splats
-from stages.scene.framing import front_camera
+from stages.scene import Camera, Splats
+from stages.scene.framing import front_camera, median_depth, orbit_cameras
 from tests import scenes
 
 HALF_ROOM = np.array([6.0, 2.5, 5.0])
@@ -48,6 +48,20 @@ def test_an_object_in_a_room_is_seen_from_inside_the_room(scale: float) -> None:
     image = render(scene, camera).image
     middle_of_picture = image[320:400, 440:520].mean((0, 1))
     assert middle_of_picture[0] > 3 * middle_of_picture[2]
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e-4, 1.0, 1e4])
+def test_where_a_scene_is_looked_at_from_scales_with_it(scale: float) -> None:
+    def scaled(factor: float) -> tuple[Splats, Camera]:
+        scene = joined((ball(3000) * factor, 0.02 * factor, (1.0, 0.1, 0.1)))
+        return scene, front_camera(scene)
+
+    (scene, camera), (one, at_one) = scaled(scale), scaled(1.0)
+    np.testing.assert_allclose(camera.centre / scale, at_one.centre, rtol=1e-4, atol=1e-6)
+    depth = median_depth(camera, scene.means) / scale
+    assert depth == pytest.approx(median_depth(at_one, one.means), rel=1e-4)
+    turn, at_turn = (orbit_cameras(each, 4, 0.9) for each in (scene, one))
+    np.testing.assert_allclose(turn[1].centre / scale, at_turn[1].centre, rtol=1e-4, atol=1e-6)
 
 
 def test_a_pillar_before_the_object_is_looked_past() -> None:
