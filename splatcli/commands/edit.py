@@ -90,6 +90,7 @@ def _edit(
         if start_db is not None:
             facts |= {"psnr_before_db": round(start_db, 3), **_quality(scene)}
         if not dry_run:
+            _check_place(target, scene)
             unwritten, figures, losses = _written(source, target, scene)
             left_out += unwritten
             facts |= {"splats": len(scene.splats) - unwritten, **figures}
@@ -99,6 +100,21 @@ def _edit(
         what = counted(left_out, "splat")
         warnings.append(f"Left out, because of values that no viewer can draw: {what}.")
     return facts | {"dropped": left_out, "warnings": warnings}
+
+
+def _check_place(target: Path, scene: EditedScene) -> None:
+    """Raise SplatError for moved splats in the export folder of a run: all commands take the
+    cameras of that run for its files, and these would see them elsewhere."""
+    run = results.run_around(target)
+    if run is None or not scene.moved:
+        return
+    raise UsageError(
+        "edit-into-run",
+        given=f"{target} lies in the export folder of {run.run_folder}, and its splats were moved, "
+        "turned or scaled.",
+        wanted="A place elsewhere: the cameras of that run do not fit them.",
+        hint=f"For example {run.run_folder.parent / target.name}",
+    )
 
 
 def _load_scene(source: Path, antialias: bool) -> tuple[EditedScene, int]:

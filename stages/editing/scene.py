@@ -66,6 +66,11 @@ class EditedScene:
         units = self.units if transform.scale == 1 else "arbitrary"
         return replace(self, splats=splats, placement=placement, units=units)
 
+    @property
+    def moved(self) -> bool:
+        """Whether the splats lie elsewhere than the capture's cameras see them."""
+        return not np.array_equal(self.placement.inverse_matrix, np.eye(4))
+
     def psnr_db(self) -> float | None:
         """Mean PSNR of the held-out views; None where there are none, and where so little of their
         pictures was kept that it says nothing."""

@@ -130,3 +130,15 @@ def test_before_training_the_views_are_those_of_the_capture(
 ) -> None:
     Path("run/4-train/manifest.json").unlink()
     assert results.views_of(Pipeline(Path("run"))) == outputs["sfm"].views
+
+
+@pytest.mark.parametrize("move", ["--move=1,0,0", "--rotate=x:180", "--scale=2"])
+def test_moved_splats_are_not_written_where_the_cameras_of_a_run_are_taken_for_theirs(
+    splat, outputs: Outputs, move: str
+) -> None:
+    result = splat("edit", "run", "run/7-export/moved.ply", move)
+    assert result.exit_code == 2
+    assert "edit-into-run" in result.stderr
+    assert not Path("run/7-export/moved.ply").exists()
+    assert splat("edit", "run", "moved.ply", move).exit_code == 0
+    assert splat("edit", "run", "run/7-export/less.ply", "--degree", "0").exit_code == 0
