@@ -14,6 +14,7 @@ from stages import formats
 from stages.base import scratch
 from stages.base.atomic import make_folder
 from stages.base.errors import UsageError
+from stages.editing import levels
 from stages.formats import format_of
 from stages.formats.replacement import check_target, replacing_asset
 from stages.formats.values import nothing_drawable
@@ -49,7 +50,7 @@ def convert(
         make_folder(target.parent)
         with replacing_asset(target) as written:
             views = results.views_of(results.run_around(source))
-            formats.write(written, splats, units=formats.units_of(source), views=views)
+            levels.write(written, splats, units=formats.units_of(source), views=views)
             console.step(f"comparing {target}", done=2, total=_STEPS)
             cameras = cameras_for(splats, views)
             prover = Prover.of(splats, cameras, source_format=rows[0].ending)

@@ -169,7 +169,7 @@ def _described(levels: Sequence[Splats], root: _Tile, units: str) -> dict[str, A
     widths = level_widths([len(level) for level in levels], finest)
     errors = [_USUAL_PIXELS / _WIDEST_PIXELS * width for width in widths]
     # so that a viewer leaves the scene out where it is smaller than a pixel
-    sides = np.ptp(finest.means, axis=0) if len(finest) else np.zeros(3)
+    sides = np.ptp(finest.means.astype(np.float64), axis=0) if len(finest) else np.zeros(3)
     whole = max(_USUAL_PIXELS * float(np.linalg.norm(sides)), *errors)
     described = _described_tile(levels, root, errors, whole) | {"refine": "REPLACE"}
     if (transform := _transform(finest)) is not None:

@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from splatcli.app import app
 from stages import formats
 from stages.base import scratch
+from stages.editing import levels
 from stages.formats.mesh_table import MESHES
 from stages.proof import checks
 from tests.cli.help_text import help_of
@@ -34,6 +35,19 @@ def test_any_format_becomes_any_other(tmp_path: Path, source: str, target: str) 
     formats.write(tmp_path / f"a.{source}", many_splats(20))
     converted(tmp_path / f"a.{source}", tmp_path / f"b.{target}", "--quiet")
     assert len(formats.read(tmp_path / f"b.{target}")) == 20
+
+
+@pytest.mark.parametrize("name", ["lod-meta.json", "tileset.json"])
+def test_streamed_assets_get_levels_of_detail(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(levels, "_FEWEST", 300)
+    formats.write(tmp_path / "a.ply", many_splats(2000))
+    converted(tmp_path / "a.ply", tmp_path / "converted" / name)
+    edited = CliRunner().invoke(app, ["edit", str(tmp_path / "a.ply"), str(tmp_path / "e" / name)])
+    assert edited.exit_code == 0, edited.stderr
+    both = [json.loads((tmp_path / folder / name).read_text()) for folder in ("converted", "e")]
+    assert both[0] == both[1]
 
 
 @pytest.mark.parametrize("ending", ["ply", "splat", "sog"])

@@ -23,6 +23,7 @@ from stages.proof.losses import losses_of
 from stages.proof.prover import Prover, cameras_for
 from stages.scene import Splats
 from stages.scene.place import EAST_DOWN_NORTH, GEOGRAPHIC, EarthPlace, geodetic
+from tests import scenes
 from tests.formats.files import glb_parts
 from tests.formats.truth import many_splats
 
@@ -82,6 +83,13 @@ def test_it_is_proven_as_any_file_is(tmp_path: Path, count: int) -> None:
     proof = Prover.of(splats, cameras_for(splats)).prove(tmp_path / "tileset.json")
     assert proof.fault == ""
     assert proof.splats == count
+
+
+def test_splats_at_the_ends_of_32_bits_are_an_asset_too(tmp_path: Path) -> None:
+    means = np.array([[-3e38, 0, 0], [0, 0, 0], [3e38, 0, 0]])
+    formats.write(tmp_path / "tileset.json", scenes.splats(means, 0.1, 0.9, [(1.0, 0.0, 0.0)] * 3))
+    tree = json.loads((tmp_path / "tileset.json").read_text())
+    assert 6e38 < tree["geometricError"] < np.inf
 
 
 def test_no_splats_at_all_are_an_asset_too(tmp_path: Path) -> None:
