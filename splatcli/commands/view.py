@@ -21,7 +21,8 @@ from stages.base import interrupt, scratch
 from stages.base.atomic import partial_prefix, remove_abandoned_files
 from stages.base.errors import SplatError, UsageError
 from stages.editing.regions import parse_numbers
-from stages.formats import format_of, html, ply
+from stages.formats import format_of, html, ply, units_of
+from stages.formats.replacement import check_target
 from stages.formats.values import drop_undrawable
 from stages.run import results
 from stages.run.pipeline import Pipeline
@@ -127,15 +128,32 @@ def _save(
             wanted="A name that ends in .html, and a colour such as #ffffff.",
             hint="splat view --save client.html --background '#ffffff'",
         )
+    check_target(path, False, target if target is not None and target.is_file() else None)
+    if path.name.lower() == "lod-meta.html" and path.with_suffix(".json").exists():
+        raise UsageError(
+            "view-page",
+            given=f"--save {path}: that page belongs to the lod-meta.json beside it.",
+            wanted="Another name.",
+            hint="splat view --save client.html",
+        )
     splats, pipeline = _loaded(target)
     first = camera_of_view(splats, results.views_of(pipeline or results.run_around(target)), camera)
     page = html.ClientPage(first, path.stem if title is None else title, background)
-    html.write(path, splats, client=page)
+    html.write(path, splats, units=_units(target, pipeline), client=page)
     size = path.stat().st_size
     if console.mode.as_json:
         console.emit("saved", out=str(path), splats=len(splats), size_bytes=size)
     else:
         console.note(f"{path}: {len(splats):,} splats, {console.size(size)}.")
+
+
+def _units(target: Path | None, pipeline: Pipeline | None) -> str:
+    """Those that the file says, or the capture of a run."""
+    if pipeline is None and target is not None:
+        return units_of(target)
+    if pipeline is None or pipeline.manifest("sfm") is None:
+        return "arbitrary"
+    return results.reconstruction_of(pipeline).units
 
 
 def _items(
@@ -147,7 +165,7 @@ def _items(
     capture = None
     if run is not None and run.manifest("sfm") is not None:
         capture = results.reconstruction_of(run)
-    units = capture.units if capture else "arbitrary"
+    units = _units(target, pipeline)
     row = format_of(target) if pipeline is None and target is not None else None
     if target is not None and row is not None and row.streamed and row.takes_views:
         content = target

@@ -98,7 +98,7 @@ def _head(scene: dict[str, Any], style: str) -> str:
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         '<link rel="icon" href="data:,">\n'
-        f"<title>{html.escape(scene['title'])}</title>\n"
+        f"<title>{html.escape(_in_utf8(scene['title']))}</title>\n"
         f"<style>\n{style}\n{_asset('parts', 'page.css')}</style>\n</head>\n<body>\n"
         f"{_asset('parts', 'body.html')}<script>\n{_asset('parts', 'failure.js')}</script>\n"
         f"{SCENE_START}{data}{CHUNK_END}"

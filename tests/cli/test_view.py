@@ -42,6 +42,27 @@ def test_options_of_a_page_that_is_written_are_refused_without_it(splat, words: 
     assert "option-alone" in result.stderr
 
 
+def test_a_page_that_is_written_says_the_units_of_its_file(splat, tmp_path: Path) -> None:
+    formats.write(tmp_path / "a.ply", many_splats(20), units="metres")
+    assert splat("view", "a.ply", "--save", "client.html").exit_code == 0
+    assert formats.units_of(tmp_path / "client.html") == "metres"
+
+
+def test_a_page_is_not_written_onto_what_is_read_or_what_an_asset_needs(
+    splat, tmp_path: Path
+) -> None:
+    formats.write(tmp_path / "a.html", many_splats(20))
+    formats.write(tmp_path / "lod" / "lod-meta.json", many_splats(20))
+    for source, page, code in (
+        ("a.html", "a.html", "target-is-source"),
+        ("lod/lod-meta.json", "lod/lod-meta.html", "view-page"),
+    ):
+        before = (tmp_path / page).read_bytes()
+        result = splat("view", source, "--save", page)
+        assert (result.exit_code, code in result.stderr) == (2, True)
+        assert (tmp_path / page).read_bytes() == before
+
+
 @pytest.mark.skipif(os.name != "posix", reason="sends the signal of Ctrl-C")
 @pytest.mark.parametrize(
     ("suffix", "stop"),

@@ -186,6 +186,11 @@ def test_the_page_fetches_nothing_from_elsewhere_and_names_cannot_break_out() ->
     assert "default-src 'none'" in policy
 
 
+def test_a_run_folder_whose_name_is_no_utf_8_has_a_page() -> None:
+    page = LivePage("caf\udce9", (), SHOTS, scenes.cloud(3).means)
+    assert "<title>caf\\xe9</title>" in page.items["/"].content.decode()  # type: ignore[union-attr]
+
+
 def test_photographs_come_only_from_their_folder(tmp_path: Path) -> None:
     (tmp_path / "sfm" / "images").mkdir(parents=True)
     (tmp_path / "sfm" / "images" / "0.jpg").write_bytes(b"photograph")
