@@ -74,10 +74,15 @@ def draw_settings_of(
 
 def near_plane(reconstruction: Reconstruction) -> float:
     """The near plane of splats of this reconstruction, world units: in front of all that its
-    training views show, and no nearer than a share of the cameras' extent."""
+    training views show. Where one of them shows something very near, it is no nearer than a share
+    of the cameras' extent; of a long row of cameras that would lie behind what most of them show.
+    """
     least = [float(np.percentile(z, MISPLACED_PERCENT)) for z in depths_seen(reconstruction)]
     extent = scene_extent(split_held_out(reconstruction.views)[0])
-    return max(NEAR_SHARE * extent, NEAR_SHARE_OF_DEPTH * min(least, default=0.0))
+    if not least:
+        return NEAR_SHARE * extent
+    usual = NEAR_SHARE_OF_DEPTH * float(np.median(least))
+    return max(min(NEAR_SHARE * extent, usual), NEAR_SHARE_OF_DEPTH * min(least))
 
 
 def near_plane_of(means: NDArray[np.floating]) -> float:

@@ -2,18 +2,37 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from stages.evaluate.image_metrics import psnr
 from stages.raster.draw import raster_settings_of, render
-from stages.scene import Camera, Splats, look_at
-from stages.scene.draw_settings import near_plane_of
+from stages.scene import Camera, Reconstruction, Splats, View, look_at
+from stages.scene.draw_settings import near_plane, near_plane_of
 from tests.scenes import join, splats
 
 RNG = np.random.default_rng(5)
 OBJECT = RNG.uniform(-0.5, 0.5, (980, 3))
 CAMERA = Camera(96, 72, 90.0, 90.0, 48.0, 36.0, look_at(np.array([0.0, 0.0, -1.5]), np.zeros(3)))
+
+
+@pytest.mark.parametrize("count", [24, 400, 1000])
+def test_a_long_row_of_cameras_sees_what_is_before_it(count: int) -> None:
+    """A street: photographs that overlap by 80 %, one unit before a facade."""
+    step, width = 0.23, 0.23 * count
+    views = []
+    for number in range(count):
+        pose = np.eye(4)
+        pose[0, 3] = -number * step
+        camera = Camera(80, 60, 69.0, 69.0, 40.0, 30.0, pose)
+        views.append(View(f"{number:04}.jpg", "x", camera))
+    points = RNG.uniform((0, -0.4, 0.9), (width, 0.4, 1.1), (60 * count, 3))
+    colours, errors = np.zeros(points.shape, np.uint8), np.ones(len(points))
+    lengths = np.full(len(points), 4, np.int32)
+    row = Reconstruction(Path(), tuple(views), points, colours, errors, lengths)
+    assert 0.1 < near_plane(row) < 0.3
 
 
 def dome(radius: float, count: int = 30) -> np.ndarray:
