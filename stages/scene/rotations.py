@@ -5,6 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+# Of `turns` in `similarity`: they decide about an axis from which all points are within a tenth of
+# the length along it, and hardly change what points in a plane or in space say.
+TURNS_WEIGHT = 0.01
+
 
 def quaternions_of(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
     """[..., 4] unit, w >= 0, of rotation matrices [..., 3, 3]: the eigenvector of Bar-Itzhack's
@@ -36,15 +40,21 @@ def matrices_of(quaternions: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def similarity(
-    a: NDArray[np.float64], b: NDArray[np.float64]
+    a: NDArray[np.float64], b: NDArray[np.float64], turns: NDArray[np.float64] | None = None
 ) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
     """(scale, rotation [3, 3], offset [3]) that take points a [N, 3] nearest b by
-    scale * rotation @ a + offset (Umeyama 1991). For collinear or
-    equal points it is one of many solutions."""
+    scale * rotation @ a + offset (Umeyama 1991).
+
+    turns: [M, 3, 3] estimates of the rotation, as those of cameras at the points, for what the
+    points leave open: without them it is one of many solutions for collinear or equal points.
+    """
     mean_a, mean_b = a.mean(0), b.mean(0)
-    u, sizes, vt = np.linalg.svd((b - mean_b).T @ (a - mean_a) / len(a))
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    rotation = u @ np.diag(signs) @ vt
+    covariance = (b - mean_b).T @ (a - mean_a) / len(a)
+    nearest = covariance
+    if turns is not None:
+        nearest = covariance / (np.linalg.norm(covariance) or 1.0) + TURNS_WEIGHT * turns.mean(0)
+    u, _, vt = np.linalg.svd(nearest)
+    rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
     spread = max(float(np.square(a - mean_a).sum(1).mean()), 1e-300)
-    scale = float((sizes * signs).sum() / spread)
+    scale = float((rotation * covariance).sum() / spread)
     return scale, rotation, mean_b - scale * rotation @ mean_a

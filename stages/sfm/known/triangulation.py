@@ -125,7 +125,7 @@ def _refined(job: Triangulation, scratch: Path) -> NDArray[np.float64]:
     intrinsics.
 
     Early rounds use wide error thresholds, since the poses are rough. The result is aligned to the
-    given camera centres by a similarity, so that the world stays the given one.
+    given cameras by a similarity, so that the world stays the given one.
     """
     poses = given = job.cameras.world_to_camera
     for slack in REFINEMENTS:
@@ -140,7 +140,8 @@ def _refined(job: Triangulation, scratch: Path) -> NDArray[np.float64]:
         poses = given.copy()
         for number in sorted(model.reg_image_ids()):
             poses[number - 1, :3] = model.images[number].cam_from_world().matrix()
-    scale, turn, shift = similarity(camera_centres(poses), camera_centres(given))
+    turns = np.einsum("vji,vjk->vik", given[:, :3, :3], poses[:, :3, :3])
+    scale, turn, shift = similarity(camera_centres(poses), camera_centres(given), turns)
     centres = scale * camera_centres(poses) @ turn.T + shift
     poses[:, :3] = poses_of(poses[:, :3, :3] @ turn.T, centres)
     return poses
