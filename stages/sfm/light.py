@@ -216,7 +216,10 @@ def _solution(
         seen = csr_array((weight, (point, views)), (len(total), count))  # [P, count]
         normal = np.diag(np.bincount(views, weight, count))
         normal -= (seen.T @ csr_array(seen.multiply(1.0 / total[:, None]))).toarray()
-        normal[np.diag_indices(count)] += REGULARISATION * normal.diagonal().max()
+        largest = normal.diagonal().max()
+        if largest <= REGULARISATION:  # no point is seen by two views
+            return offsets
+        normal[np.diag_indices(count)] += REGULARISATION * largest
         mean = np.bincount(point, weight * ev) / total
         right = np.bincount(views, weight * (ev - mean[point]), count)
         offsets = np.linalg.solve(normal, right)

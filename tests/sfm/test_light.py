@@ -135,6 +135,37 @@ def test_even_light_is_within_a_cameras_noise(tmp_path: Path) -> None:
     assert not found.light.any()
 
 
+def grey(folder: Path, levels: tuple[int, ...]) -> list[Path]:
+    files = [folder / f"grey {number}.png" for number in range(len(levels))]
+    for file, level in zip(files, levels, strict=True):
+        Image.fromarray(np.full((200, 200, 3), level, np.uint8)).save(file)
+    return files
+
+
+def test_points_that_one_photograph_alone_shows_well_enough_say_nothing(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    points, views = (part.astype(np.int32) for part in np.divmod(np.arange(180), 3))
+    seen_at = Observations(points, views, rng.uniform(20, 180, (180, 2)))
+    found = measure_light(grey(tmp_path, (120, 5, 5)), rng.normal(size=(60, 3)), seen_at)
+    assert not np.nan_to_num(found.light).any()
+
+
+def test_a_part_of_the_scene_that_one_photograph_alone_shows_well_is_no_obstacle(
+    tmp_path: Path,
+) -> None:
+    rng, files = np.random.default_rng(0), grey(tmp_path, (120, 125, 130))
+    picture = np.full((200, 200, 3), 120, np.uint8)
+    picture[:60, :60] = 0
+    Image.fromarray(picture).save(files[0])
+    diagonal = np.repeat(rng.uniform(-1, 1, 400)[:, None], 3, axis=1)
+    positions = np.concatenate([diagonal, [[2.0, -2.0, 2.0]]])  # an octant of its own
+    points, views = (part.astype(np.int32) for part in np.divmod(np.arange(1202), 3))
+    px = rng.uniform(100, 180, (1202, 2))
+    px[1200] = 20, 20
+    found = measure_light(files, positions, Observations(points, views, px))
+    assert (np.diff(found.light[:, 0]) > 0).all()
+
+
 def test_a_photograph_without_shared_points_has_no_light(tmp_path: Path) -> None:
     files, positions, observed = photographs(tmp_path, np.zeros((VIEWS, 3)))
     others = observed.views != 2
