@@ -118,11 +118,14 @@ def _warn_of_held_out(photographs: int, were: str, report: Report) -> None:
 
 
 def _views(reconstruction: Reconstruction, side: int, report: Report) -> Sequence[EvaluationView]:
-    """Some training views with their photographs, at most `side` pixels long."""
+    """Some training views with their photographs, at most `side` pixels long, of which masks leave
+    a part."""
     training, _ = split_held_out(reconstruction.views)
     settings = replace(draw_settings_of(reconstruction), side=side)
     chosen = evenly_spaced(training, _VIEWS)
-    return load_evaluation_views(reconstruction.folder, chosen, settings, report.stop_requested)
+    stop = report.stop_requested
+    loaded = load_evaluation_views(reconstruction.folder, chosen, settings, stop)
+    return [view for view in loaded if view.counts]
 
 
 def _db(splats: Splats, antialias: bool, views: Sequence[EvaluationView]) -> float:

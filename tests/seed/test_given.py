@@ -16,7 +16,7 @@ from stages.base.errors import SplatError
 from stages.base.stage import Report
 from stages.raster.draw import render
 from stages.raster.similarity import Similarity, rotation_about
-from stages.scene import DrawSettings, Splats
+from stages.scene import IGNORE, DrawSettings, Splats
 from stages.scene.storage import save_splats
 from stages.seed import given, stage
 from stages.seed.given import given_splats
@@ -193,6 +193,20 @@ def test_splats_of_another_scene_are_refused_with_both_figures(
     assert caught.value.code == "seed-splats-do-not-fit"
     assert caught.value.given.count(" dB") == 2
     assert not (tmp_path / "splats.bin").exists()
+
+
+def test_a_masked_photograph_does_not_let_splats_of_another_scene_pass(
+    scene: SmallScene, tmp_path: Path
+) -> None:
+    view, *others = scene.reconstruction.views
+    empty = np.zeros((view.camera.height, view.camera.width), np.uint8)
+    Image.fromarray(empty).save(scene.reconstruction.folder / "none.png")
+    views = (replace(view, mask="none.png", outside=IGNORE), *others)
+    far = Similarity(1.0, np.eye(3), np.array([0.0, 40.0, 0.0]))
+    path = written(tmp_path, scene.splats, far.after(TO_FILE))
+    with pytest.raises(SplatError) as caught:
+        given_splats(path, replace(scene.reconstruction, views=views), Report())
+    assert caught.value.code == "seed-splats-do-not-fit"
 
 
 def test_splats_need_the_cameras_that_they_were_trained_with(
