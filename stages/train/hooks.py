@@ -30,7 +30,7 @@ from stages.train.optimiser import empty_model
 from stages.train.schedule import HALF_SIZE_END, QUARTER
 from stages.train.sparsification import Sparsification
 from stages.train.time_limit import TimeLimit
-from stages.train.trainer import Trainer
+from stages.train.trainer import REGISTRATION_STEPS, Trainer
 from stages.train.transients import Comparison, transient_parts
 
 CHECKPOINT_SECONDS = 30.0
@@ -52,7 +52,8 @@ def step_hooks(trainer: Trainer, start: Splats) -> list[StepHook]:
     density: DensityRule = BoundedDensity(adaptive, task.within) if task.within else adaptive
     # Of many held-out views a part is evaluated, so that it takes less time than training.
     views = [task.held_out[i] for i in evaluation_subset(len(task.held_out), EVALUATED)]
-    time_limit = TimeLimit(task.seconds, task.most_steps)
+    registered = REGISTRATION_STEPS * len(task.held_out) if trainer.refinement is not None else 0
+    time_limit = TimeLimit(task.seconds, task.most_steps, steps_after=registered)
     # of the cameras before their refinement, which a resumed run has, too
     free_space = known_free_space(start.means, [v.levels[-1].camera for v in task.views])
     return [
@@ -185,21 +186,22 @@ class Evaluation:
         began = trainer.clock.elapsed().seconds
         scores = evaluate(trainer.render, self.views)
         elapsed = trainer.clock.elapsed()
-        self.time_limit.reserve_for_end(elapsed.seconds - began)
+        all_views = len(trainer.task.held_out) / max(1, len(self.views))
+        self.time_limit.reserve_for_end(all_views * (elapsed.seconds - began))
         trainer.history.add(step, len(trainer.stepper), scores, elapsed)
 
 
 @dataclass
 class Checkpointing:
-    """Writes a checkpoint every CHECKPOINT_SECONDS, and before it raises Interrupted if the report
-    asks to stop."""
+    """Writes a checkpoint every CHECKPOINT_SECONDS, before it raises Interrupted if the report
+    asks to stop, and after the last step, since what follows may be interrupted, too."""
 
     last: float = field(default_factory=time.monotonic)
 
     def after_step(self, trainer: Trainer, step: int) -> None:
         steps = trainer.schedule.steps
         stops = trainer.task.report.stop_requested.is_set() and step < steps
-        if stops or time.monotonic() - self.last > CHECKPOINT_SECONDS:
+        if stops or step == steps or time.monotonic() - self.last > CHECKPOINT_SECONDS:
             trainer.save(step)
             self.last = time.monotonic()
         if stops:

@@ -24,11 +24,13 @@ class TimeLimit:
         seconds: the limit; 0 for none.
         most_steps: of the run; 0 for any number.
         reserve: seconds of it that are kept for what follows the last step.
+        steps_after: the last one, on held-out views.
     """
 
     seconds: float
     most_steps: int = 0
     reserve: float = 0.0
+    steps_after: int = 0
     _last: tuple[int, float] | None = None
 
     def steps(self, step: int, elapsed: float) -> int | None:
@@ -42,7 +44,7 @@ class TimeLimit:
             return None
         self._last = step, elapsed
         left = self.seconds - self.reserve - elapsed
-        fitting = step + max(1, int(left * steps / seconds))
+        fitting = step + max(1, int(left * steps / seconds) - self.steps_after)
         return min(fitting, self.most_steps) if self.most_steps else fitting
 
     def reserve_for_end(self, evaluation_seconds: float) -> None:

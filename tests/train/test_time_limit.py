@@ -30,9 +30,9 @@ def schedule(steps=3000):
     return Schedule(steps=steps, extent=1.0, sh_degree=2, n_start=1000, seed=0)
 
 
-def simulated(seconds, cost, steps=100_000, most_steps=0):
+def simulated(seconds, cost, steps=100_000, most_steps=0, steps_after=0):
     """(seconds that a run takes, its schedule at the end), if a step at a share costs `cost`."""
-    plan, pace = schedule(steps), TimeLimit(seconds, most_steps, reserve=1.0)
+    plan, pace = schedule(steps), TimeLimit(seconds, most_steps, 1.0, steps_after)
     spent, step = 0.0, 0
     while step < plan.steps:
         spent += cost(plan.share(step))
@@ -113,6 +113,12 @@ def test_however_long_the_limit_a_run_makes_the_steps_that_its_photographs_are_w
         limited = {"steps": steps, "seconds": 36_000.0, "steps_per_view": 1_000}
         assert steps_of(tmp_path / f"{steps}", 5, **limited) == (4_000, 4_000)
     assert steps_of(tmp_path / "more", 5, steps=9_000, seconds=60.0)[0] == 9_000
+
+
+def test_steps_after_the_last_one_have_their_time_in_the_limit():
+    _, without = simulated(60.0, lambda share: 0.02)
+    _, plan = simulated(60.0, lambda share: 0.02, steps_after=720)
+    assert without.steps - plan.steps == pytest.approx(720, abs=60)
 
 
 def test_steps_that_take_a_second_each_still_end_in_time():
