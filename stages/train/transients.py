@@ -67,7 +67,7 @@ class Comparison:
         image = np.ascontiguousarray(drawn.image.transpose(2, 0, 1))
         target = target_of(level, image, background)
         photograph = target * np.float32(1 / 255 if target.dtype == np.uint8 else 1)
-        side = max(1, max(drawn.depth.shape) // PARTS)
+        side = max(1, min(max(drawn.depth.shape) // PARTS, *drawn.depth.shape))
         height, width = (length // side for length in drawn.depth.shape)
 
         def parts(picture: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -23,7 +23,7 @@ from stages.train.checkpoint import load_checkpoint
 from stages.train.conversion import model_of
 from stages.train.hooks import Transients
 from stages.train.schedule import HALF_SIZE_END, Schedule
-from stages.train.transients import PARTS, join_masks, save_masks, without
+from stages.train.transients import PARTS, Comparison, join_masks, save_masks, without
 from stages.train.views import Level
 from tests.scenes import camera, splats
 from tests.train.pictures import trainer_of, view_of
@@ -125,6 +125,14 @@ def test_the_step_forgets_views_once_parts_of_them_are_ignored(tmp_path, monkeyp
     monkeypatch.setattr(made.stepper, "forget_views", lambda: calls.append(len(made.transient)))
     transient(made)
     assert calls == [7]
+
+
+def test_a_photograph_much_longer_than_wide_has_parts_too():
+    where = camera(16, 48 * 16, 180.0)
+    level = view_of("a", np.full((48 * 16, 16, 3), 0.5), where).levels[1]
+    compared = Comparison.of(level, render(wall(), level.camera), (0.0, 0.0, 0.0))
+    assert compared.camera.width == 1
+    assert np.isfinite(compared.differences).all()
 
 
 def test_a_cut_out_photograph_is_not_masked_further():
