@@ -64,12 +64,12 @@ FORMAT_CELLS = (
     (
         ("lod-meta.json",),
         "PlayCanvas, SuperSplat, which load nearby chunks first",
-        "as `sog`, in chunks and levels of detail; written by `splat edit`",
+        "as `sog`, in chunks and levels of detail; written by `splat edit`, `convert`",
     ),
     (
         ("tileset.json",),
         "CesiumJS: 3D Tiles on the globe",
-        "as `spz.glb`, in tiles of levels of detail; written by `splat edit`",
+        "as `spz.glb`, in tiles of levels of detail; written by `splat edit`, `convert`",
     ),
     (
         ("html",),
