@@ -46,7 +46,7 @@ def turned_to_grid(scale: MetricScale, crs: str, report: Report) -> MetricScale:
 
 def in_crs(place: EarthPlace, crs: str, report: Report) -> EarthPlace:
     """The same place in the projected system `crs`, as far as a plane can follow it. Raises
-    SplatError "crs-elsewhere"."""
+    SplatError "crs-elsewhere", and "crs-not-projected" for a system that is a mirror image."""
     import pyproj
 
     target = projected_system(crs)
@@ -71,8 +71,15 @@ def in_crs(place: EarthPlace, crs: str, report: Report) -> EarthPlace:
             wanted="The system of the region where the photographs were taken.",
             hint="Choose another --crs, or leave it away.",
         )
-    _warn_outside(place, target, crs, report)
     grid = (found[1:4] - found[4:]).T / (2 * _STEP_M)
+    if np.linalg.det(grid) <= 0:
+        raise UsageError(
+            "crs-not-projected",
+            given=f"--crs {crs} ({target.name}) counts to the south and west, as a mirror image.",
+            wanted="A system that counts to the east and north.",
+            hint="Choose another of the region: for EPSG:5513, EPSG:5514.",
+        )
+    _warn_outside(place, target, crs, report)
     return EarthPlace(crs, found[0], grid @ place.axes)
 
 
@@ -85,7 +92,7 @@ def _warn_outside(place: EarthPlace, target: Any, crs: str, report: Report) -> N
     area = target.area_of_use
     if area is None or (
         area.south <= latitude <= area.north
-        and (longitude - area.west) % 360 <= (area.east - area.west) % 360
+        and (longitude - area.west) % 360 <= ((area.east - area.west) % 360 or 360)
     ):
         return
     report.warn(

@@ -209,6 +209,23 @@ def test_a_place_in_one_grid_is_found_in_another() -> None:
     np.testing.assert_allclose(by_utm.axes, direct.axes, atol=1e-5)
 
 
+def test_a_grid_that_is_a_mirror_image_is_refused() -> None:
+    pytest.importorskip("pyproj")
+    prague = EarthPlace(GEOGRAPHIC, np.array([50.08, 14.43, 250.0]), np.eye(3))
+    with pytest.raises(SplatError) as raised:
+        in_crs(prague, "EPSG:5513", Report())  # Krovak, to the south and west
+    assert raised.value.code == "crs-not-projected"
+    assert np.linalg.det(in_crs(prague, "EPSG:5514", Report()).axes) == pytest.approx(1, abs=0.01)
+
+
+@pytest.mark.parametrize(("crs", "at"), [("EPSG:3857", (48, 11, 0)), ("EPSG:3031", (-75, 30, 0))])
+def test_grids_of_all_longitudes_have_no_outside_there(crs: str, at: tuple[int, ...]) -> None:
+    pytest.importorskip("pyproj")
+    report = Report()
+    in_crs(EarthPlace(GEOGRAPHIC, np.array(at, np.float64), np.eye(3)), crs, report)
+    assert report.warnings == []
+
+
 def test_a_grid_of_another_region_is_a_warning_or_an_error() -> None:
     pytest.importorskip("pyproj")
     report = Report()
