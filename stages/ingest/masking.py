@@ -201,13 +201,14 @@ def _bright(image: Image.Image) -> NDArray[np.bool_]:
 
 
 def _values(image: Image.Image) -> NDArray[np.float32]:
-    """[H, W] brightness, or alpha if the picture has alpha and a single colour."""
+    """[H, W] brightness, or alpha if it varies and the colour does not."""
     if image.mode in ("P", "PA") or "transparency" in image.info:
         image = image.convert("RGBA")
     if image.mode in ("RGBA", "LA"):
         alpha = np.asarray(image.getchannel("A"), np.float32)
         colour = np.asarray(image.convert("RGBA").convert("L"), np.float32)
-        return alpha if np.ptp(colour) == 0 else np.minimum(colour, alpha)
+        is_alpha = np.ptp(colour) == 0 and np.ptp(alpha) > 0
+        return alpha if is_alpha else np.minimum(colour, alpha)
     grey = image if image.mode in ("1", "L") or image.mode[0] in "IF" else image.convert("L")
     return np.asarray(grey, np.float32)
 

@@ -211,6 +211,18 @@ def test_a_mask_that_leaves_nothing_names_its_photograph(photos: Path, tmp_path:
     assert (error.code, name in error.given) == ("mask-empty", True)
 
 
+@pytest.mark.parametrize("mode", ["L", "RGB", "RGBA", "LA", "P", "1"])
+def test_a_mask_of_one_colour_means_the_same_in_every_mode(
+    photos: Path, tmp_path: Path, mode: str
+) -> None:
+    folder = masked(tmp_path / "m", photos)
+    first = folder / f"{Path(names(photos)[0]).stem}.png"
+    Image.fromarray(np.zeros_like(HALF)).convert(mode).save(first)
+    assert refused(photos, masks=folder).code == "mask-empty"
+    capture, _ = taken(photos, masks=folder, invert_masks=True)
+    assert not capture.photos[0].mask or mask_of(capture).all()
+
+
 def test_masks_that_take_nothing_away_are_refused(photos: Path, tmp_path: Path) -> None:
     error = refused(photos, masks=masked(tmp_path / "m", photos, np.full_like(HALF, 255)))
     assert (error.code, names(photos)[0] in error.given) == ("mask-full", True)
