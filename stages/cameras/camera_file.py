@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pillow_heif
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -217,6 +218,7 @@ def picture_beside(path: Path) -> Path | None:
 
 def stored_size(path: Path) -> tuple[int, int]:
     """(width, height) of a picture. Raises BadFileError if it is none."""
+    pillow_heif.register_heif_opener()
     try:
         with Image.open(path) as picture:
             return picture.size

@@ -7,9 +7,12 @@ or by a library of others, and must be found there by the cameras that were read
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
+import pillow_heif
 import pytest
 from PIL import Image
 
@@ -182,3 +185,15 @@ def test_gigabytes_are_refused_before_they_are_read(tmp_path: Path, name: str) -
     with pytest.raises(SplatError, match=r"4\.3 GB") as caught:
         read_cameras(tmp_path / name)
     assert caught.value.code == "cameras-unreadable"
+
+
+def test_the_size_of_a_heic_is_read_before_any_photograph(tmp_path: Path) -> None:
+    """By a process that has not set up the reader of photographs."""
+    code = (
+        "import sys; from pathlib import Path; from stages.cameras.camera_file import stored_size; "
+        "print(stored_size(Path(sys.argv[1])))"
+    )
+    pillow_heif.from_pillow(Image.new("RGB", (64, 48))).save(tmp_path / "a.heic")
+    command = [sys.executable, "-c", code, str(tmp_path / "a.heic")]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "(64, 48)"
