@@ -143,6 +143,12 @@ def _remove_masks(
     return paired, tuple(sorted(stray, key=natural_key))
 
 
+def _name_in(folder: Path, path: Path) -> str:
+    """The name of a file relative to `folder`; "" if it lies elsewhere."""
+    path, folder = path.resolve(), folder.resolve()
+    return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else ""
+
+
 def _remove_depths(
     files: dict[str, Path], folder: Path, source: Path | None
 ) -> tuple[dict[str, DepthFile], tuple[str, ...]]:
@@ -152,7 +158,8 @@ def _remove_depths(
     maps: dict[str, Path] = {}
     unit = 0.0
     if source is not None and source.is_file():
-        maps, unit = nerfstudio.depth_maps(source)
+        named, unit = nerfstudio.depth_maps(source)
+        maps = {_name_in(folder, source.parent / name) or name: at for name, at in named.items()}
     elif source is not None and source.is_dir() and source.resolve() != folder.resolve():
         every = _files_by_name(source).items()
         maps = {name: path for name, path in every if suffix_of(name) in depth_files.SUFFIXES}

@@ -249,6 +249,26 @@ def spoil(folder: Path, how: str) -> None:
         (folder / "IMG_1.exr").write_bytes(b"no picture at all")
 
 
+def test_a_transforms_json_names_maps_of_photographs_of_one_name_in_two_folders(
+    photos: Path,
+) -> None:
+    names = [f"{camera}/IMG_{number}.jpg" for camera in ("left", "right") for number in (1, 2)]
+    for number, name in enumerate(names):
+        (photos / name).parent.mkdir(exist_ok=True)
+        save(photos / name, textured(number))
+        write_map(photos.parent / "z" / f"{number}.npy")
+    frames = [
+        {"file_path": f"photos/{name}", "depth_file_path": f"z/{number}.npy"}
+        for number, name in enumerate(names)
+    ]
+    path = photos.parent / "transforms.json"
+    path.write_text(json.dumps({"frames": frames}))
+    found = find(photos, None, path).depths
+    assert {name: file.path.name for name, file in found.items()} == {
+        name: f"{number}.npy" for number, name in enumerate(names)
+    }
+
+
 @pytest.mark.parametrize(
     "how", ["aspect", "eight bits", "colour", "nothing", "two", "cut short", "no picture"]
 )
