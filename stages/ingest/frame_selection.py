@@ -19,6 +19,7 @@ STEP = 0.05  # of the longer side, from one chosen frame to the next
 FEWEST_FRAMES = 24  # of one video that moves little, as far as they differ by LEAST_STEP
 LEAST_STEP = 0.015  # of the longer side
 MAX_FRAMES = 300  # of one video, unless a number is given
+MOST_TRIES = 50  # numbers of stretches up to twice the frames wanted
 _SHAKE = 0.01  # of the longer side: motion to and fro within it is camera shake
 MAX_GAP = 0.25  # of the longer side; a blurred frame is better than a wider gap
 _WINDOW = 121  # frames that a frame's sharpness is compared with
@@ -86,9 +87,10 @@ def select_frames(measured: Sequence[MeasuredFrame], wanted: int) -> list[Select
         numbers = _one_per_stretch(path, sharp, wanted)
     else:
         # Stretches without a sharp frame give none: try more of them until there are enough frames.
-        for places in range(wanted, 3 * wanted):
-            numbers = _one_per_stretch(path, sharp, places)
-            if len(numbers) >= min(wanted, len(measured)):
+        wanted, numbers = min(wanted, len(measured)), []
+        for places in range(wanted, 3 * wanted, max(1, wanted // MOST_TRIES)):
+            numbers = max(numbers, _one_per_stretch(path, sharp, places), key=len)
+            if len(numbers) >= wanted:
                 break
         kept = np.linspace(0, len(numbers) - 1, min(wanted, len(numbers))).round().astype(int)
         numbers = [numbers[i] for i in kept]

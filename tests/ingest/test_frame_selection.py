@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from stages.ingest import frame_selection
 from stages.ingest.frame_selection import (
     BLURRED_BELOW,
     FEWEST_FRAMES,
@@ -91,6 +92,22 @@ def test_as_many_frames_as_wanted_also_if_some_are_blurred():
         assert len(found) == wanted
         assert numbers(found) == sorted(set(numbers(found)))
         assert all(one.sharpness >= BLURRED_BELOW for one in found)
+
+
+def test_any_number_of_frames_is_selected_soon(monkeypatch):
+    made = []
+
+    def counted(*given):
+        made.append(given)
+        return one_per_stretch(*given)
+
+    one_per_stretch = frame_selection._one_per_stretch
+    monkeypatch.setattr(frame_selection, "_one_per_stretch", counted)
+    sharp = np.full(300, 3.0)
+    sharp[::3] = 0.1
+    found = [len(select_frames(walk(np.full(300, 0.01), sharp), n)) for n in (100, 400, 100_000)]
+    assert len(made) < 400
+    assert found[0] <= found[1] == found[2]
 
 
 def test_more_frames_than_there_are_gives_all_that_are_sharp():
