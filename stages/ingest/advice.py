@@ -53,7 +53,7 @@ TEXTS = {  # by code, in the order of the warnings; {names} of files or photogra
     "ingest-blurred": "Blurred, compared with the others: {names}. "
     "Take these again or remove them; more light or a shorter exposure helps.",
     "ingest-small": f"Smaller than {SMALL_BELOW_PX} pixels: {{names}}. "
-    "Use the camera's original files; 1600 pixels and more are best.",
+    "Use the camera's original files and no smaller --max-side; 1600 pixels and more are best.",
     "ingest-dark": "Very dark: {names}. Use more light, or a tripod and a longer exposure.",
 }
 

@@ -47,7 +47,7 @@ def losses_of(path: Path, splats: Splats, proof: Proof) -> dict[str, str]:
             f"draw .{row.ending} plainly: splats look too strong there, the more the farther away. "
             "A viewer that compensates opacities (Spark, Brush, PlayCanvas with antialiasing "
             "switched on) draws it right. For others, in the run's folder: "
-            f"`splat export run --format {row.ending} --drawing plain`."
+            f"`splat export --format {row.ending} --drawing plain`."
         )
     if not row.holds_origin and is_located(splats):
         losses["origin"] = (
