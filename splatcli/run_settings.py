@@ -11,7 +11,6 @@ from typing import Any
 import typer
 
 from splatcli import console, options
-from splatcli.input_files import check_files
 from stages.base.errors import UsageError
 from stages.base.settings import UNSET, Setting, changed, settings_of
 from stages.raster.backends import backend_of
@@ -114,6 +113,8 @@ def requested(pipeline: Pipeline, given: Mapping[str, Any], preset: str | None) 
     """Settings by stage name of a whole run: the recorded ones, changed by a preset, then by the
     given options. A run folder as splats stands for those that it trained. Raises SplatError, also
     for known cameras and given splats that no run could use."""
+    from splatcli.input_files import check_files  # loads NumPy, which `--help` does without
+
     given = dict(given)
     if "formats" in given:
         given["formats"] = pipeline.with_exported(given["formats"])

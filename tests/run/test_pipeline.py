@@ -209,7 +209,7 @@ def test_each_of_several_depth_maps_of_one_name_is_a_reason(
     pipeline.run({"copy": WithDepth(depth=file)})
     assert ran(pipeline) == []
     (tmp_path / "maps" / "left" / "1.png").write_text("changed")
-    assert reasons(pipeline)["copy"] == "depth left/1.png changed"
+    assert reasons(pipeline)["copy"] == "depth file left/1.png changed"
 
 
 def test_hidden_files_among_photographs_do_not_count(finished: Pipeline, photos: Path) -> None:

@@ -61,10 +61,15 @@ def test_the_near_plane_is_a_fifth_of_the_least_depth_that_a_photograph_shows():
     assert draw_settings_of(held_still(0.1, points)).near == pytest.approx(7.0 / 5)
 
 
-@pytest.mark.parametrize("points", [np.zeros((0, 3)), -wall(3.0), wall(0.01)])
-def test_without_points_or_beside_them_the_near_plane_is_a_share_of_the_extent(points):
+@pytest.mark.parametrize("points", [np.zeros((0, 3)), -wall(3.0)])
+def test_without_points_before_the_cameras_the_near_plane_is_a_share_of_the_extent(points):
     made = held_still(0.5, points)
     assert draw_settings_of(made).near == pytest.approx(0.01 * scene_extent(made.views[1:]))
+
+
+def test_what_all_photographs_show_is_behind_the_near_plane_however_near_it_is():
+    """A hundredth of the extent is 0.008."""
+    assert draw_settings_of(held_still(0.5, wall(0.01))).near == pytest.approx(0.01 / 5)
 
 
 def test_held_out_cameras_do_not_change_the_unit_of_training():
