@@ -79,8 +79,8 @@ class EvaluationView:
         return replace(self, pixels=pixels, excluded=np.asarray((self.image >= BRIGHT).any(2)))
 
     def compared_within(self, valid: NDArray[np.bool_] | None) -> EvaluationView:
-        """The same, where only pixels of `valid` [h, w] are compared; at another size, those of
-        which all that they cover is valid. None: all."""
+        """The same, where only pixels of `valid` [h, w] are compared; None: all. At another size a
+        pixel is compared if all pixels of `valid` under it are true."""
         if valid is None:
             return self
         height, width = self.pixels.shape[:2]
@@ -309,8 +309,8 @@ def psnr_of_views_db(
 def mean_psnr_db(
     splats: Splats, views: Iterable[EvaluationView], backend: str, scale: float = 1.0
 ) -> float:
-    """Mean PSNR over the views, each `EvaluationView.scaled`, of which a pixel is compared, dB; 0
-    if there is none."""
+    """Mean PSNR over the views that have a compared pixel, each `EvaluationView.scaled`, dB; 0
+    without such a view."""
     scaled = (view.scaled(scale) for view in views)
     found = psnr_of_views_db(splats, scaled, backend)
     found = found[~np.isnan(found)]

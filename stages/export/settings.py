@@ -34,7 +34,7 @@ class ExportSettings:
         "Name of the files, without a suffix.",
         pattern=_NAME,
         wanted="A name that every system takes: letters, digits, spaces, - and _; no "
-        "folder, no suffix, and no end such as .compressed, with which .ply is another format.",
+        "folder, no suffix, and no end such as .compressed: with .ply that is another format.",
     )
     backend: str = backend_setting()
     drawing: str = drawing_setting()

@@ -13,7 +13,7 @@ DEFAULT_FORMATS = ("ply", "splat", "glb", "usdz")
 LOSSLESS = "ply"
 ALL_MESHES = "mesh"  # a value of `--format`: every format of meshes
 CHOICES = (*FORMATS, ALL_MESHES, *MESHES)
-# A name that ends in one of these, as a.compressed does, forms with an ending another one.
+# A name must not end in one of these: a.compressed and .ply together end as another format does.
 FIRST_PARTS = tuple(
     sorted({ending.rpartition(".")[0] for ending in (*FORMATS, *MESHES) if "." in ending})
 )

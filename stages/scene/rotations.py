@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-# Of `turns` in `similarity`: they decide about an axis from which all points are within a tenth of
-# the length along it, and hardly change what points in a plane or in space say.
+# Weight of `turns` in `similarity`. They decide the turn about an axis if no point is further from
+# it than a tenth of its length. They hardly change what points in a plane or in space say.
 TURNS_WEIGHT = 0.01
 
 

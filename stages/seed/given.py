@@ -118,8 +118,8 @@ def _warn_of_held_out(photographs: int, were: str, report: Report) -> None:
 
 
 def _views(reconstruction: Reconstruction, side: int, report: Report) -> Sequence[EvaluationView]:
-    """Some training views with their photographs, at most `side` pixels long, of which masks leave
-    a part."""
+    """Some training views with their photographs, at most `side` pixels long. Views that masks
+    cover whole are left out."""
     training, _ = split_held_out(reconstruction.views)
     settings = replace(draw_settings_of(reconstruction), side=side)
     chosen = evenly_spaced(training, _VIEWS)

@@ -89,8 +89,8 @@ class Comparison:
 
 def compare_runs(first: Candidate, second: Candidate) -> Comparison:
     """Evaluate both on the views that both hold out, at the smaller size of the two, each with its
-    own run's camera, on the pixels that count in both. Views of which at some size no pixel counts
-    are left out. Raises SplatError (compare-nothing-in-common, compare-no-pixels)."""
+    own run's camera, on the pixels that count in both. Views without such a pixel at some size are
+    left out. Raises SplatError (compare-nothing-in-common, compare-no-pixels)."""
     training, names = (sorted(a.keys() & b) for a, b in zip(first.split, second.split, strict=True))
     if not names:
         raise UsageError(
@@ -121,8 +121,8 @@ def _on_common_pixels(
     both: tuple[Candidate, Candidate], names: Sequence[str], side_px: int
 ) -> list[tuple[EvaluationView, EvaluationView]]:
     """The views `names` of both, compared where both masks are valid: the run with the smaller ones
-    would be better because they leave out what is hard to draw. Without views of which no pixel is
-    compared at some of `SIZES`."""
+    would be better because they leave out what is hard to draw. Views without a compared pixel at
+    some of `SIZES` are left out."""
     first, second = (one.views(names, side_px) for one in both)
     pairs = (
         (a.compared_within(b.valid), b.compared_within(a.valid))
@@ -140,7 +140,7 @@ def _no_pixels(first: Candidate, second: Candidate) -> UsageError:
         "compare-no-pixels",
         given=f"The masks of {first.name} and {second.name} leave no pixel of a held-out "
         "photograph that counts in both at full, half and quarter size.",
-        wanted="Held-out photographs of which masks keep a part.",
+        wanted="Held-out photographs that masks do not cover whole.",
         hint="Make one of the runs again with larger masks, or without --masks.",
     )
 

@@ -154,8 +154,8 @@ def test_an_evaluation_at_sizes_draws_each_size_and_begins_with_the_full_one(
 
 
 def with_sparse_masks(scene: SmallScene, folder: Path) -> Sequence[EvaluationView]:
-    """The views, of which masks leave nothing of the first, and no pixel of the second that all
-    those of a smaller picture lie around."""
+    """The views, two of them with masks. That of the first is empty. That of the second keeps every
+    other column, so that no pixel is left at half size."""
     nothing, stripes = np.zeros((54, 72), np.uint8), np.zeros((54, 72), np.uint8)
     stripes[:, ::2] = 255
     first, second, *others = scene.reconstruction.views

@@ -185,7 +185,7 @@ def test_held_out_views_that_lose_more_are_in_a_warning(scene, tmp_path) -> None
 def test_more_splats_are_not_advised_where_too_few_views_decide(
     tmp_path, count: int, advised: bool
 ) -> None:
-    scene = small_scene(tmp_path, n=60)  # of which each tenth is needed
+    scene = small_scene(tmp_path, n=60)  # a tenth of them would do
     few = replace(scene.reconstruction, views=scene.reconstruction.views[:count])
     _, report = run(replace(scene, reconstruction=few), scene.splats, tmp_path)
     assert ("prune-more-would-pay" in dict(report.warnings)) == advised
