@@ -29,12 +29,16 @@ _ADOBE_GAMMA = 563 / 256
 def icc_to_srgb(image: Image.Image, profile: bytes) -> Image.Image:
     """`image` in sRGB; itself if that changes nothing. Grey and CMYK pictures become RGB.
 
-    Raises ImageCms.PyCMSError for a profile that is damaged, or made for another colour mode.
+    A grey picture may have a profile of RGB. Raises ImageCms.PyCMSError for a profile that is
+    damaged, or made for another colour mode.
     """
-    transform = _transform(profile, image.mode)
+    mode = image.mode
+    if mode == "L" and profile[16:20] == b"RGB ":  # ICC.1:2022, 7.2.8: space of the data
+        mode = "RGB"
+    transform = _transform(profile, mode)
     if transform is None:
         return image
-    converted = ImageCms.applyTransform(image, transform)
+    converted = ImageCms.applyTransform(image.convert(mode), transform)
     assert converted is not None
     converted.info.pop("icc_profile", None)
     return converted

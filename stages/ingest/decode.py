@@ -263,15 +263,14 @@ def _basic_mode(image: Image.Image) -> Image.Image:
 
 
 def _over_black(image: Image.Image) -> tuple[Image.Image, Image.Image | None]:
-    """(the picture over black, its alpha channel if it is transparent anywhere)."""
+    """(the picture over black as RGB or L, its alpha channel if it is transparent anywhere)."""
     if image.mode not in ("RGBA", "LA"):
         return image, None
-    layered = image.convert("RGBA")
-    alpha = layered.getchannel("A")
+    mode, alpha = image.mode[:-1], image.getchannel("A")
     if alpha.getextrema() == (255, 255):
-        return layered.convert("RGB"), None
-    below = Image.new("RGBA", image.size, "black")
-    return Image.alpha_composite(below, layered).convert("RGB"), alpha
+        return image.convert(mode), None
+    above = image.convert(mode)
+    return Image.composite(above, Image.new(mode, image.size), alpha), alpha
 
 
 def _resized(image: Image.Image, size: tuple[int, int], stored: tuple[int, int]) -> Image.Image:

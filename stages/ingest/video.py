@@ -96,12 +96,13 @@ class Video:
             stream.thread_type = "AUTO"
             start = stream.start_time or 0
             aspect = float(stream.sample_aspect_ratio or 1)
-            last = 0.0
+            last = end = 0.0
             for picture in self._decoded(container, stream):
                 _check_size(picture.width, picture.height)
                 colours = Colours.of(stream.codec_context)
                 if picture.pts is not None:
                     last = max(last, float((picture.pts - start) * stream.time_base))
+                    end = max(end, last + float((picture.duration or 0) * stream.time_base))
                 yield Frame(self.decoded, last, picture, colours, aspect)
                 self.decoded += 1
             whole = float(stream.duration * stream.time_base) if stream.duration else 0.0
@@ -112,7 +113,7 @@ class Video:
                 else "it holds no frames",
                 _COPY_OR_EXPORT,
             )
-        self.missing_s = whole - last if whole - last > _LOST_SECONDS else 0.0
+        self.missing_s = whole - end if whole - end > _LOST_SECONDS else 0.0
 
     def about_frames(self) -> int:
         """The number of frames that the file announces, roughly; 0 if it announces none."""

@@ -219,6 +219,44 @@ def test_a_jpeg_that_names_the_srgb_profile_keeps_its_bytes(photos: Path) -> Non
     assert (capture.folder / "photos/x.jpg").read_bytes() == (photos / "x.jpg").read_bytes()
 
 
+def grey_profile(gamma: float) -> bytes:
+    """A profile of grey pictures (ICC.1:2022, 8.3.2), white as D50, with a power as its curve."""
+    curve = b"curv" + bytes(4) + (1).to_bytes(4, "big") + round(gamma * 256).to_bytes(2, "big")
+    white = b"XYZ " + bytes(4) + b"".join(
+        round(one * 65536).to_bytes(4, "big") for one in (0.9642, 1.0, 0.8249)
+    )
+    words = b"desc" + bytes(4) + (5).to_bytes(4, "big") + b"grey\0" + bytes(78)
+    tags, table, body = {b"desc": words, b"wtpt": white, b"kTRC": curve}, b"", b""
+    for name, data in tags.items():
+        at = 128 + 4 + 12 * len(tags) + len(body)
+        table += name + at.to_bytes(4, "big") + len(data).to_bytes(4, "big")
+        body += data + bytes(-len(data) % 4)
+    header = bytes(8) + b"\2\x40\0\0" + b"mntrGRAYXYZ " + bytes(12) + b"acsp" + bytes(28)
+    header += white[8:] + bytes(48)
+    whole = header + len(tags).to_bytes(4, "big") + table + body
+    return len(whole).to_bytes(4, "big") + whole[4:]
+
+
+@pytest.mark.parametrize("mode", ["L", "LA"])
+def test_grey_pictures_are_converted_by_their_profile(photos: Path, mode: str) -> None:
+    """Half of the samples' range is 0.5 of the light where the curve is linear: 188 in sRGB."""
+    grey = Image.new(mode, (96, 64), 128 if mode == "L" else (128, 255))
+    if mode == "LA":
+        grey.putpixel((0, 0), (128, 0))
+    grey.save(photos / "x.png", icc_profile=grey_profile(1.0))
+    capture, warnings, _ = ingested(photos)
+    np.testing.assert_allclose(picture(capture, "x.png")[30, 40], 188, atol=1.01)
+    assert "ingest-colour-profile" not in warnings
+
+
+def test_a_grey_picture_may_have_a_profile_of_rgb(photos: Path) -> None:
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    Image.new("L", (96, 64), 128).save(photos / "x.jpg", icc_profile=profile)
+    capture, warnings, _ = ingested(photos)
+    assert (capture.folder / "photos/x.jpg").read_bytes() == (photos / "x.jpg").read_bytes()
+    assert "ingest-colour-profile" not in warnings
+
+
 def test_a_damaged_profile_is_said_and_passed_over(photos: Path) -> None:
     save(photos / "x.png", textured(5), icc_profile=b"no profile at all")
     capture, warnings, _ = ingested(photos)

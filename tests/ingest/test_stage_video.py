@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from stages.base.errors import SplatError
 from stages.base.stage import Report
@@ -163,6 +164,15 @@ def test_a_film_that_breaks_off_is_used_as_far_as_it_goes(tmp_path: Path) -> Non
     assert numbers(capture)[-1] < report.metrics["videos"][0]["frames"]
     assert 20 < report.metrics["videos"][0]["frames"] < 80
     assert "walk.mp4 is damaged, 2 s at its end are missing" in warnings["ingest-video-damaged"]
+
+
+def test_a_slow_film_is_whole_where_its_last_picture_stands_long(tmp_path: Path) -> None:
+    video = tmp_path / "slow.gif"
+    first, *others = (Image.fromarray(at(30.0 * i)) for i in range(8))
+    first.save(video, save_all=True, append_images=others, duration=2000)
+    _, warnings, report = ingested(video, tmp_path / "out")
+    assert report.metrics["videos"][0]["missing_seconds"] == 0
+    assert "ingest-video-damaged" not in warnings
 
 
 def broken(video: Path, kind: str) -> Path:

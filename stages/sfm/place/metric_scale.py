@@ -39,6 +39,11 @@ class KnownScale:
     metres: bool = False
     georeference: Georeference = NO_GEOREFERENCE
 
+    def given_by(self) -> str:
+        """The option by which the user gives the scale; "" if none does."""
+        options = {"--scale": self.distance, "--marker": self.marker, "--metres": self.metres}
+        return next((name for name, given in options.items() if given), "")
+
 
 UNKNOWN_SCALE = KnownScale()
 
@@ -97,13 +102,17 @@ def _placed(metric: MetricScale | None, known: KnownScale, report: Report) -> Me
     if not known.crs:
         return metric
     if metric is None or metric.place is None:
+        option = known.given_by()
+        why = (
+            f". {option} gives the size of the scene, and GPS is not used beside it"
+            if option
+            else ", neither from GPS nor from the file of --cameras"
+        )
         report.warn(
             "sfm-crs-unused",
-            f"--crs {known.crs} is not used: where the scene lies is not known, neither from GPS "
-            "nor from the file of --cameras.",
+            f"--crs {known.crs} is not used: where the scene lies is not known{why}.",
         )
         return metric
-
     return turned_to_grid(metric, known.crs, report)
 
 

@@ -267,6 +267,15 @@ def test_without_pyproj_the_error_says_what_to_install(monkeypatch: pytest.Monke
 def test_a_grid_for_a_scene_without_place_is_a_warning() -> None:
     local = flight()
     photos = [replace(photo, gps=None) for photo in photographs(on_earth(local))]
-    known = KnownScale(("0.jpg", "1.jpg", "3"), crs="EPSG:25832")
+    known = KnownScale(metres=True, crs="EPSG:25832")
     _, report = placed(photos, world_of(local), known)
     assert [code for code, _ in report.warnings] == ["sfm-crs-unused"]
+
+
+def test_a_grid_beside_a_given_size_is_not_used_for_that_size() -> None:
+    local = flight()
+    known = KnownScale(("0.jpg", "1.jpg", "3"), crs="EPSG:25832")
+    _, report = placed(photographs(on_earth(local)), world_of(local), known)
+    ((code, text),) = report.warnings
+    assert code == "sfm-crs-unused"
+    assert "--scale gives the size of the scene, and GPS is not used beside it" in text
