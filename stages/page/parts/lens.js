@@ -1,8 +1,8 @@
 // The exact lens and place of a shot over the viewer's own camera, which knows neither roll nor an
 // off-centre principal point. The place is held until the visitor moves; the lens stays, so that
 // the picture does not jump at the first touch.
-const NEAR = 0.01; // nearer than what a photograph shows
-const FAR = 1e5;
+const NEAR = 1e-3; // of the distance of what a photograph shows
+const FAR = 1e7;
 
 function frustumOf(shot, width, height, near) {
     // The whole picture fits into the canvas, centred, as `object-fit: contain` shows a photograph.
@@ -44,6 +44,7 @@ class Lens {
 
     hold(shot) {
         this.shot = shot;
+        this.depth = Math.hypot(...shot.target.map((value, i) => value - shot.position[i]));
         const { camera } = this.entity;
         camera.calculateProjection = (matrix) => {
             const { width, height } = this.app.graphicsDevice;
@@ -64,7 +65,7 @@ class Lens {
         if (!this.shot) return;
         this.entity.setPosition(...this.shot.position);
         this.entity.setRotation(...this.shot.rotation);
-        this.entity.camera.nearClip = NEAR;
-        this.entity.camera.farClip = FAR;
+        this.entity.camera.nearClip = NEAR * this.depth;
+        this.entity.camera.farClip = FAR * this.depth;
     }
 }
