@@ -66,7 +66,7 @@ class IngestSettings:
 
 STAGE = Stage(
     "ingest",
-    version=17,
+    version=18,
     reads=(),
     settings_type=IngestSettings,
     **in_module("stages.ingest.stage"),

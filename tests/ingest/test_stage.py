@@ -222,8 +222,10 @@ def test_a_jpeg_that_names_the_srgb_profile_keeps_its_bytes(photos: Path) -> Non
 def grey_profile(gamma: float) -> bytes:
     """A profile of grey pictures (ICC.1:2022, 8.3.2), white as D50, with a power as its curve."""
     curve = b"curv" + bytes(4) + (1).to_bytes(4, "big") + round(gamma * 256).to_bytes(2, "big")
-    white = b"XYZ " + bytes(4) + b"".join(
-        round(one * 65536).to_bytes(4, "big") for one in (0.9642, 1.0, 0.8249)
+    white = (
+        b"XYZ "
+        + bytes(4)
+        + b"".join(round(one * 65536).to_bytes(4, "big") for one in (0.9642, 1.0, 0.8249))
     )
     words = b"desc" + bytes(4) + (5).to_bytes(4, "big") + b"grey\0" + bytes(78)
     tags, table, body = {b"desc": words, b"wtpt": white, b"kTRC": curve}, b"", b""
