@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -19,7 +20,7 @@ from splatcli.options import given_only
 from splatcli.progress import counting
 from splatcli.render_options import RenderOptions
 from stages.base import memory
-from stages.base.errors import Interrupted, ResourceError
+from stages.base.errors import Interrupted, ResourceError, UsageError
 from stages.base.interrupt import stop_on_signals
 from stages.base.settings import changed
 from stages.raster.definition import Rendering
@@ -32,6 +33,9 @@ from stages.viewer.sinks import frames_beyond
 
 _BYTES_PER_PIXEL = 100  # colour and depth planes, their copies, and the tiles' lists
 _LARGEST_FILM_SIDE = 1280  # pixels, unless --width or a camera file says otherwise
+# Pixels. VP8's fields have 14 bits (RFC 6386, 9.1). JPEG's have 16 (ITU-T T.81, B.2.2), and
+# libjpeg's limit is a little lower.
+_LARGEST_SIDES = {".webp": 16383, ".jpg": 65500, ".jpeg": 65500}
 
 
 def render(
@@ -48,9 +52,9 @@ def render(
 ) -> None:
     """Draw the splats: from a photograph's camera, or as a film along a path.
 
-    Frames that are in the folder already are written again. Depth is z in world units, 0 where
-    there is nothing. Pictures of two thirds of the size in training and less are drawn larger and
-    averaged.
+    Frames that are in the folder already are written again. Depth is z in world units of the splat
+    at which half of the light is stopped, 0 where less is. Pictures of two thirds of the size in
+    training and less are drawn larger and averaged.
     """
     wanted = changed(RenderOptions(), given_only(given))
     kind = wanted.kind(out)
@@ -59,6 +63,8 @@ def render(
     run = pipeline or results.run_around(target)
     cameras = _cameras(splats, results.views_of(run), wanted, kind)
     _check_memory(max(cameras, key=lambda camera: camera.width * camera.height))
+    if kind == "picture":
+        _check_format(out, cameras[0])
     console.note_compiling()
     draw = renderer(splats, backend=backend or results.backend_of_run(run))
     draw = supersampled(draw, splats.draw_settings.side or results.training_side_of(run))
@@ -112,6 +118,18 @@ def _check_memory(camera: Camera) -> None:
             given=f"A picture of {camera.width} x {camera.height} takes {console.size(needed)}.",
             wanted=f"At most the {console.size(free)} that are free.",
             hint="Choose a smaller --width.",
+        )
+
+
+def _check_format(out: Path, camera: Camera) -> None:
+    """Whether the format of `out` holds so large a picture. Raises SplatError."""
+    most = _LARGEST_SIDES.get(out.suffix.lower(), math.inf)
+    if max(camera.width, camera.height) > most:
+        raise UsageError(
+            "render-format-size",
+            given=f"A picture of {camera.width} x {camera.height}.",
+            wanted=f"At most {most:,} pixels a side, the limit of {out.suffix}.",
+            hint=f"Choose --out {out.with_suffix('.png').name}, or a smaller --width.",
         )
 
 

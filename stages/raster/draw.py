@@ -44,7 +44,7 @@ def rendering_of(forward: Forward) -> Rendering:
     """A copy of the result of a forward pass with depths."""
     image = forward.image
     return Rendering(
-        np.ascontiguousarray(image[:3].transpose(1, 2, 0)),
+        image[:3].transpose(1, 2, 0).copy(),
         image[3].copy(),
         image[4].copy(),
         image[5].copy(),

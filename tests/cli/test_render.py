@@ -171,6 +171,7 @@ def test_half_a_capture_is_reported(splat, scene: Path, monkeypatch) -> None:
         (["--out", "a.mp4", "--path", "a.ply"], 2, "COLMAP"),
         (["--out", "a.mp4", "--path", "photos"], 2, "COLMAP"),
         (["--out", "a.png", "--width", "99999"], 2, "--width"),
+        (["--out", "a.webp", "--width", "16384"], 2, "--out a.png"),
         (["--out", "a.png", "--backend", "magic"], 2, "backend"),
         (["--out", "no/a.mp4", "--frames", "2", "--width", "16"], 6, "folder"),
     ],

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,6 +28,42 @@ def test_frames_do_not_disturb_each_other(backend: str) -> None:
         alone = render(splats, camera, backend=backend)
         for name in ("image", "alpha", "depth", "median_depth"):
             np.testing.assert_array_equal(getattr(frame, name), getattr(alone, name))
+
+
+def test_a_picture_of_one_pixel_outlives_the_next() -> None:
+    red = scenes.splats([[0, 0, 3.0]], scales=1.0, opacities=0.9, rgb=(1.0, 0.0, 0.0))
+    draw = renderer(red, backend="cpu")
+    first = draw(scenes.camera(1, 1)).image
+    before = first.copy()
+    draw(scenes.camera(1, 1).resized(1, 1).moved(np.diag([1.0, -1.0, -1.0, 1.0])))
+    np.testing.assert_array_equal(first, before)
+
+
+_TWO_THREADS = """
+import sys, threading
+import numpy as np
+from stages.raster.draw import render
+from tests import scenes
+clouds = [scenes.cloud(2000, seed=seed) for seed in (1, 2)]
+camera = scenes.camera(320, 240)
+wanted = [render(cloud, camera, backend="cpu").image for cloud in clouds]
+right = []
+def draw(which):
+    for _ in range(20):
+        image = render(clouds[which], camera, backend="cpu").image
+        right.append(np.array_equal(image, wanted[which]))
+threads = [threading.Thread(target=draw, args=(i,)) for i in (0, 1)]
+for thread in threads: thread.start()
+for thread in threads: thread.join()
+sys.exit(0 if len(right) == 40 and all(right) else 1)
+"""
+
+
+def test_threads_draw_at_the_same_time() -> None:
+    """In a process of its own: what they disturb of each other may end it."""
+    words = [sys.executable, "-c", _TWO_THREADS]
+    paths = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    assert subprocess.run(words, env=paths, check=False, timeout=300).returncode == 0
 
 
 def test_an_unknown_backend_is_named() -> None:

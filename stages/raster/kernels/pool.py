@@ -26,7 +26,6 @@ class Pool:
             if self.n_threads > 1
             else None
         )
-        self._ticket = np.zeros(1, np.int64)
 
     def share(
         self,
@@ -34,19 +33,20 @@ class Pool:
         *args: Any,
         beside: Callable[[], Any] | None = None,
     ) -> None:
-        """Call kernel(counter, *args) in every thread; see `take_ticket` for the counter.
+        """Call kernel(counter, *args) in every thread; see `take_ticket` for the counter. Several
+        threads may call this at the same time.
 
         beside: a function that the calling thread runs first, while the others begin.
         """
-        self._ticket[0] = 0
+        counter = np.zeros(1, np.int64)  # of this call: another thread may draw, too
         futures = [
-            self._others.submit(kernel, self._ticket, *args)
+            self._others.submit(kernel, counter, *args)
             for _ in range(self.n_threads - 1)
             if self._others is not None
         ]
         if beside is not None:
             beside()
-        kernel(self._ticket, *args)
+        kernel(counter, *args)
         for future in futures:
             future.result()
 
