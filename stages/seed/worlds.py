@@ -25,7 +25,7 @@ from stages.sfm.known.match_cameras import name_parts
 
 NERFSTUDIO = "dataparser_transforms.json"  # beside the splats: how their world was normalised
 _FEWEST_POINTS = 4  # that have principal axes
-_FEWEST_SHARED = 3  # cameras that a similarity follows from
+FEWEST_SHARED = 3  # cameras that a similarity follows from
 _REWEIGHTED = 50  # times
 _FLIPS = tuple(np.diag(signs) for signs in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)))
 
@@ -70,10 +70,10 @@ def _of_cameras_beside(
     worlds = []
     for folder in (path.parent, *path.parents[2:3]):
         if file := inria.locate(folder):
-            pairs = _pairs(inria.read(file).views, reconstruction, folders=False)
-            if len(pairs) < _FEWEST_SHARED:
+            pairs = cameras_of_one_name(inria.read(file).views, reconstruction.views, folders=False)
+            if len(pairs) < FEWEST_SHARED:
                 continue
-            found = _between(pairs)
+            found = similarity_between(pairs)
             if not np.allclose(found.inverse_matrix, known.inverse_matrix, rtol=1e-4, atol=1e-4):
                 worlds.append(World(f"the world of {file.name}", found))
     return worlds
@@ -84,37 +84,41 @@ def world_of_run(earlier: Reconstruction, reconstruction: Reconstruction) -> Wor
 
     Raises SplatError "seed-splats-do-not-fit" where fewer than three have the same name in both.
     """
-    pairs = _pairs(earlier.views, reconstruction, folders=True)
-    if len(pairs) < _FEWEST_SHARED:
+    pairs = cameras_of_one_name(earlier.views, reconstruction.views, folders=True)
+    if len(pairs) < FEWEST_SHARED:
         raise SplatError(
             "seed-splats-do-not-fit",
             given=f"The run that trained the splats ({earlier.folder.parent}) and this one have "
             f"{counted(len(pairs), 'photograph')} of the same name with a known camera.",
-            wanted=f"At least {_FEWEST_SHARED}, to bring the splats into this run's world.",
+            wanted=f"At least {FEWEST_SHARED}, to bring the splats into this run's world.",
             hint="Give the photographs of that run, with others added if you like.",
         )
-    found = _between(pairs)
+    found = similarity_between(pairs)
     # cameras and means are relative to each run's own origin; `given` moves what includes it
     offset = found.offset - found.scale * found.rotation @ earlier.origin
     return World("the earlier run's world", replace(found, offset=offset))
 
 
-def _pairs(
-    views: Sequence[View], reconstruction: Reconstruction, folders: bool
+def cameras_of_one_name(
+    there: Sequence[View], here: Sequence[View], folders: bool
 ) -> list[tuple[Camera, Camera]]:
-    """(camera elsewhere, camera in this run) of the photographs of one name, suffixes apart.
-    folders: whether names there keep them; without, names that occur twice do not count."""
+    """(camera there, camera here) of the photographs of one name, suffixes apart.
+
+    Args:
+        there, here: the views of two worlds.
+        folders: whether names there keep them; without, names that occur twice do not count.
+    """
 
     def by_name(views: Sequence[View]) -> dict[tuple[str, ...], Camera]:
         keys = [tuple(name_parts(view.name)[: None if folders else 1]) for view in views]
         counts = Counter(keys)
         return {k: v.camera for k, v in zip(keys, views, strict=True) if counts[k] == 1}
 
-    there, here = by_name(views), by_name(reconstruction.views)
-    return [(there[key], here[key]) for key in there if key in here]
+    old, new = by_name(there), by_name(here)
+    return [(old[key], new[key]) for key in old if key in new]
 
 
-def _between(pairs: Sequence[tuple[Camera, Camera]]) -> Similarity:
+def similarity_between(pairs: Sequence[tuple[Camera, Camera]]) -> Similarity:
     """The similarity that takes the first cameras nearest the second.
 
     First the rotation and then scale and offset have the least sum of distances (not of their
