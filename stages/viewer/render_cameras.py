@@ -7,11 +7,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from stages.base.errors import UsageError
 from stages.base.text import counted
 from stages.cameras.camera_formats import read_cameras
+from stages.raster.similarity import Similarity
 from stages.scene import Camera, Splats, View
 from stages.scene.framing import first_camera
+from stages.seed.worlds import FEWEST_SHARED, cameras_of_one_name, similarity_between
 from stages.viewer import camera_paths, orbit
 
 _TURN_S = 8.0  # the default duration of one turn around the scene
@@ -19,6 +23,7 @@ _SHORTEST_S, _LONGEST_S = 4.0, 40.0  # default durations of other paths
 # Standard deviation of the smoothing of hand-held cameras, in the path's default duration: a film
 # of few frames goes the same way.
 _SMOOTHING_S = 0.3
+_SAME_WORLD = 1e-3  # radians, and parts of the cameras' extent: less is the rounding of a file
 
 
 @dataclass(frozen=True)
@@ -85,7 +90,8 @@ def path_cameras(
 
     Args:
         path: "orbit", "capture" (past the views' cameras), or a camera file: its cameras, or a
-            smooth path through them if a duration is given.
+            smooth path through them if a duration is given. Where at least three of them have the
+            names of views, all are brought from their world into that of the views.
 
     Raises SplatError (render-no-capture, render-path, and what reading a camera file raises).
     """
@@ -94,7 +100,8 @@ def path_cameras(
         return _orbit(cameras, splats, duration)
     if path == "capture":
         return CameraPath(_past_views(cameras, splats, duration))
-    cameras, notes = _read_cameras(path)
+    cameras, notes = _read_cameras(path, views)
+    cameras = [splats.local(camera) for camera in cameras]
     if not duration.is_default:
         cameras = _interpolated(cameras, splats, duration)
     return CameraPath(cameras, True, notes)
@@ -141,8 +148,8 @@ def _default_s(cameras: list[Camera], splats: Splats) -> float:
     return min(max(_TURN_S * turns, _SHORTEST_S), _LONGEST_S)
 
 
-def _read_cameras(path: str) -> tuple[list[Camera], tuple[str, ...]]:
-    """(the cameras of a file, notes). Raises SplatError."""
+def _read_cameras(path: str, views: Sequence[View]) -> tuple[list[Camera], tuple[str, ...]]:
+    """(the cameras of a file in the world of `views`, notes). Raises SplatError."""
     if not Path(path).exists():
         raise UsageError(
             "render-path",
@@ -150,11 +157,39 @@ def _read_cameras(path: str) -> tuple[list[Camera], tuple[str, ...]]:
             wanted="orbit, capture, a transforms.json or a folder with a COLMAP model.",
             hint="Leave --path away to go around the scene once.",
         )
-    cameras = read_cameras(Path(path))
-    notes: tuple[str, ...] = ()
-    if cameras.distorted:
-        notes = (
-            f"Warning: in {path} are {counted(cameras.distorted, 'camera')} whose lens distorts; "
-            "the pictures are drawn as pinhole cameras see them.",
+    found = read_cameras(Path(path))
+    cameras = [view.camera for view in found.views]
+    notes: list[str] = []
+    if found.distorted:
+        notes.append(
+            f"Warning: in {path} are {counted(found.distorted, 'camera')} whose lens distorts; "
+            "the pictures are drawn as pinhole cameras see them."
         )
-    return [view.camera for view in cameras.views], notes
+    world = _world_of(found.views, views)
+    if world is not None:
+        cameras = [world.apply_to_camera(camera) for camera in cameras]
+        notes.append(
+            f"{path} is in another world than the run. Its cameras were moved, turned and scaled "
+            "so that those of the same photographs agree."
+        )
+    return cameras, tuple(notes)
+
+
+def _world_of(there: Sequence[View], here: Sequence[View]) -> Similarity | None:
+    """The similarity that takes the cameras of a file to those of the run with the same names; None
+    where it changes nothing, or too few names are the same to know it."""
+    for folders in (True, False):
+        pairs = cameras_of_one_name(there, here, folders)
+        if len(pairs) < FEWEST_SHARED:
+            continue
+        old = np.array([camera.centre for camera, _ in pairs])
+        extent = float(np.ptp(old, axis=0).max())
+        if not extent:
+            return None
+        world = similarity_between(pairs)
+        moved = world.scale * old @ world.rotation.T + world.offset
+        turned = np.abs(world.rotation - np.eye(3)).max()
+        if turned < _SAME_WORLD and np.abs(moved - old).max() < _SAME_WORLD * extent:
+            return None
+        return world
+    return None

@@ -6,6 +6,7 @@ import json
 import os
 import signal
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -20,6 +21,7 @@ from stages.base.errors import Interrupted
 from stages.cameras import nerfstudio
 from stages.raster.definition import Rendering
 from stages.raster.draw import render
+from stages.raster.similarity import Similarity, rotation_about
 from stages.run import results
 from stages.scene import Camera, View, look_at
 from stages.viewer.sinks import eight_bits
@@ -130,6 +132,40 @@ def test_a_camera_file_is_drawn_camera_by_camera(splat, scene: Path, captured) -
         )
     )
     assert told["frames"] == 3
+
+
+def test_cameras_of_the_same_photographs_in_another_world_are_brought_into_the_runs(
+    splat, scene: Path, captured
+) -> None:
+    """As a run's own camera file is, which was levelled and moved."""
+    turn = rotation_about(np.array([1.0, 2.0, 3.0]), 70)
+    world = Similarity(3.0, turn, np.array([5.0, -2.0, 9.0]))
+    there = [replace(view, camera=world.apply_to_camera(view.camera)) for view in captured]
+    nerfstudio.write(
+        Path("t.json"), [*there[:4], replace(there[4], name="new.jpg")], Path("images")
+    )
+    result = splat("render", str(scene), "--path", "t.json", "--out", "f")
+    assert "another world" in result.stderr
+    for path, view in zip(sorted(Path("f").iterdir()), captured, strict=False):
+        wanted = eight_bits(render(CLOUD, view.camera).image).astype(int)
+        assert np.abs(np.array(Image.open(path)) - wanted).max() <= 1
+
+
+def test_a_camera_file_beside_a_scene_far_away_is_in_its_coordinates(
+    splat, tmp_path: Path, captured, monkeypatch
+) -> None:
+    monkeypatch.setattr(results, "views_of", lambda pipeline: ())
+    there = np.array([500_000.25, 4_649_776.5, 120.125])
+    far = Similarity(offset=there).apply_to_splats(CLOUD)
+    assert np.abs(far.origin).max() > 1e6
+    formats.write(tmp_path / "far.glb", far)
+    moved = Similarity(offset=there)
+    views = [replace(view, camera=moved.apply_to_camera(view.camera)) for view in captured]
+    nerfstudio.write(Path("t.json"), views, Path("images"))
+    splat("render", str(tmp_path / "far.glb"), "--path", "t.json", "--out", "f")
+    for path, view in zip(sorted(Path("f").iterdir()), captured, strict=True):
+        wanted = eight_bits(render(CLOUD, view.camera).image).astype(int)
+        assert np.abs(np.array(Image.open(path)) - wanted).max() <= 2
 
 
 def test_a_distorted_camera_file_is_drawn_with_a_note(splat, scene: Path, captured) -> None:
