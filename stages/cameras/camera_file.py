@@ -30,7 +30,7 @@ MAX_DISTANCE = 1e12  # world units; its square is far from overflowing
 ROTATION_TOLERANCE = 1e-3  # of R^T R, for text with three decimals
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".heic")  # of pictures
 _NO_NAME = re.compile("[\0\ud800-\udc7f\udd00-\udfff]")  # PEP 383: \udc80 to \udcff are bytes
-_EXACT = 1e-9  # of R^T R: a larger error is not rounding of float64
+_EXACT = 1e-12  # of R^T R: a larger error is not rounding of float64
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,8 @@ def camera_file(
         folder, georeference: as in `CameraFile`.
         names: V names.
         optics: V.
-        poses: [V, 3, 4] world to camera; rounded rotations are made orthogonal.
+        poses: [V, 3, 4] world to camera; rounded rotations are made orthogonal, and translations
+            kept.
 
     Raises:
         BadFileError: there is no camera, or one is invalid.
@@ -149,15 +150,11 @@ def camera_file(
     _refuse(names, bad, "a focal length and a principal point")
     _refuse(names, ~(np.abs(poses) < MAX_DISTANCE).all((1, 2)), "a position and a direction")
     rotations = poses[:, :, :3]
-    error = np.abs(rotations.transpose(0, 2, 1) @ rotations - np.eye(3)).max((1, 2))
-    _refuse(
-        names, (error > ROTATION_TOLERANCE) | (np.linalg.det(rotations) <= 0), "a rotation matrix"
-    )
-    inexact = error > _EXACT
-    left, _, right = np.linalg.svd(rotations[inexact])
+    bad = (_orthogonality_error(rotations) > ROTATION_TOLERANCE) | (np.linalg.det(rotations) <= 0)
+    _refuse(names, bad, "a rotation matrix")
     matrices = np.tile(np.eye(4), (len(names), 1, 1))
     matrices[:, :3] = poses
-    matrices[inexact, :3, :3] = left @ right
+    matrices[:, :3, :3] = _without_rounding(rotations)
     views = tuple(
         View(name, name, Camera(int(size[0]), int(size[1]), *lens.tolist(), matrix))  # type: ignore[call-arg]
         for name, size, lens, matrix in zip(names, sizes, intrinsics, matrices, strict=True)
@@ -166,10 +163,31 @@ def camera_file(
 
 
 def poses_of(rotations: NDArray[np.float64], centres: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[V, 3, 4] world to camera, from its rotations [V, 3, 3] and the cameras' centres [V, 3]."""
+    """[V, 3, 4] world to camera, from its rotations [V, 3, 3] and the cameras' centres [V, 3].
+
+    Rounded rotations are made orthogonal first: otherwise their error times the distance from the
+    origin would be an error of the centres.
+    """
     with np.errstate(all="ignore"):  # `camera_file` checks the result
+        rotations = _without_rounding(rotations)
         translations = -np.einsum("vij,vj->vi", rotations, centres)
     return np.concatenate([rotations, translations[:, :, None]], axis=2)
+
+
+def _without_rounding(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The rotations [V, 3, 3] nearest to matrices that rounding has changed; other matrices stay
+    as they are."""
+    error = _orthogonality_error(rotations)
+    rounded = (error > _EXACT) & (error <= ROTATION_TOLERANCE)
+    left, _, right = np.linalg.svd(rotations[rounded])
+    result = rotations.copy()
+    result[rounded] = left @ right
+    return result
+
+
+def _orthogonality_error(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[V] the largest error of R^T R."""
+    return np.asarray(np.abs(matrices.transpose(0, 2, 1) @ matrices - np.eye(3)).max((1, 2)))
 
 
 def json_of(path: Path) -> Any:

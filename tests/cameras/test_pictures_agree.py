@@ -7,6 +7,7 @@ or by a library of others, and must be found there by the cameras that were read
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -18,8 +19,10 @@ from PIL import Image
 
 from stages.base.errors import SplatError
 from stages.cameras.camera_formats import CAMERA_FILES, files_of, read_cameras, read_points
+from tests.cameras import drawn, drawn_surveys
 from tests.cameras.drawn import (
     COLOURS,
+    EYES,
     HEIGHT,
     POINTS,
     POSES,
@@ -110,6 +113,34 @@ def test_files_beside_a_colmap_model_are_no_part_of_it(tmp_path: Path) -> None:
     assert {path.stem for path in before} == {"cameras", "images", "points3D"}
     (tmp_path / "notes.txt").write_text("x")
     assert files_of(tmp_path) == before
+
+
+FAR = np.array([476_000.0, 5_430_000.0, 200.0])
+NO_CENTRES = {"colmap", "opensfm", "bundler"}  # they store translations
+NUMBER = re.compile(r"(?<![0-9])-?[0-9]\.[0-9]{7,}(?:e-[0-9]+)?")
+
+
+@pytest.mark.parametrize("decimals", [6, 10])
+@pytest.mark.parametrize("name", sorted({*MADE, "polycam"} - NO_CENTRES))
+def test_rounded_rotations_do_not_move_cameras_far_from_the_origin(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, decimals: int
+) -> None:
+    poses = POSES.copy()
+    poses[:, :3, 3] -= poses[:, :3, :3] @ FAR
+    for module in (drawn, drawn_surveys):
+        monkeypatch.setattr(module, "POSES", poses)
+    monkeypatch.setattr(drawn, "POINTS", POINTS + FAR)
+    path = (MADE | {"polycam": polycam})[name](tmp_path)
+    for file in tmp_path.rglob("*"):
+        if file.suffix in (".json", ".xml", ".csv", ".xmp"):
+            text = file.read_text(encoding="utf-8")
+            rounded = NUMBER.sub(lambda found: f"{float(found[0]):.{decimals}f}", text)
+            file.write_text(rounded, encoding="utf-8")
+        elif file.suffix == ".npy":
+            np.save(file, np.load(file).round(decimals))
+    views = sorted(read_cameras(path).views, key=lambda view: view.name)
+    centres = np.array([view.camera.centre for view in views])
+    np.testing.assert_allclose(centres, EYES + FAR, rtol=0, atol=1e-6)
 
 
 def _cut(path: Path) -> None:
