@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from stages.base.errors import SplatError
 from stages.cameras.camera_file import Georeference
 from stages.cameras.camera_formats import read_cameras
-from stages.scene.place import GEOGRAPHIC
-from tests.cameras.drawn import CHUNK, EYES, metashape, opensfm
+from stages.scene.place import GEOGRAPHIC, geocentric
+from tests.cameras.drawn import CHUNK, EYES, POSES, metashape, opensfm
 from tests.cameras.drawn_surveys import MADE, SHIFT, UTM32, arkit, opf, polycam
 
 TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
@@ -58,6 +60,89 @@ def test_a_chunk_without_a_unit_is_arbitrary(
 ) -> None:
     ground = transformed(tmp_path, np.eye(3), shift, scale, reference)
     assert (ground.metres_per_unit, ground.axes) == (0.0, None)
+
+
+COMPONENTS = (
+    (TURN, np.array([4_000_000.0, 300_000.0, 4_950_000.0]), 0.5),
+    (
+        Rotation.from_rotvec([0.3, 1.2, -0.4]).as_matrix(),
+        np.array([4_000_004.0, 299_997, 4.95e6]),
+        3,
+    ),
+)
+
+
+def in_components(folder: Path, of_camera: list[int], placed: int = 2) -> Path:
+    """Metashape's cameras, each in the coordinates of its component: COMPONENTS[i] takes these to
+    the reference. placed: components whose transform the file holds. The first takes cameras at
+    EYES there."""
+    path = metashape(folder)
+    text = path.read_text().replace(CHUNK, "")
+    turn, shift, scale = COMPONENTS[0]
+    for number, (pose, index) in enumerate(zip(POSES, of_camera, strict=True)):
+        to_world = np.linalg.inv(pose)
+        own_turn, own_shift, own_scale = COMPONENTS[index]
+        there = scale * turn @ to_world[:3, 3] + shift
+        to_own = np.eye(4)
+        to_own[:3, :3] = own_turn.T @ turn @ to_world[:3, :3]
+        to_own[:3, 3] = own_turn.T @ (there - own_shift) / own_scale
+        words = [" ".join(map(repr, map(float, m.ravel()))) for m in (to_world, to_own)]
+        label = f'label="p_{number}"'
+        assert words[0] in text
+        text = text.replace(words[0], words[1]).replace(label, f'{label} component_id="{index}"')
+    inside = "".join(
+        f'<component id="{index}"><transform><rotation>{" ".join(map(str, turn.ravel()))}'
+        f"</rotation><translation>{' '.join(map(str, shift))}</translation><scale>{scale}</scale>"
+        "</transform></component>"
+        for index, (turn, shift, scale) in enumerate(COMPONENTS[:placed])
+    )
+    path.write_text(text.replace("</chunk>", f"<components>{inside}</components></chunk>"))
+    return path
+
+
+@pytest.mark.parametrize("of_camera", [[0, 0, 0, 1], [0, 1, 0, 1], [1, 0, 0, 0]])
+def test_metashapes_components_are_in_one_world(tmp_path: Path, of_camera: list[int]) -> None:
+    """That of the component with most cameras."""
+    found = read_cameras(in_components(tmp_path, of_camera))
+    moved = np.array([view.camera.world_to_camera for view in found.views])
+    # Coordinates of the earth are rounded to 1e-9 m.
+    np.testing.assert_allclose(moved, POSES, atol=1e-8)
+    assert found.georeference.metres_per_unit == 0.5
+
+
+def test_the_component_with_most_cameras_is_metashapes_world(tmp_path: Path) -> None:
+    found = read_cameras(in_components(tmp_path, [0, 1, 1, 1]))
+    assert found.georeference.metres_per_unit == 3
+    centres = np.array([view.camera.centre for view in found.views])
+    distances = np.linalg.norm(centres[:, None] - centres, axis=2) * 3
+    wanted = np.linalg.norm(EYES[:, None] - EYES, axis=2) * 0.5
+    np.testing.assert_allclose(distances, wanted, atol=1e-8)
+    place = found.georeference.place
+    assert place is not None
+    np.testing.assert_allclose(geocentric(place.offset), COMPONENTS[1][1], atol=1e-5)
+
+
+def test_the_transform_of_another_component_is_not_that_of_the_cameras(tmp_path: Path) -> None:
+    found = read_cameras(in_components(tmp_path, [0, 0, 0, 0]))
+    assert found.georeference.metres_per_unit == 0.5
+    found = read_cameras(in_components(tmp_path / "other", [1, 1, 1, 1], placed=1))
+    assert found.georeference.metres_per_unit == 0.0
+
+
+@pytest.mark.parametrize("placed", [0, 1])
+def test_components_that_are_not_placed_are_refused(tmp_path: Path, placed: int) -> None:
+    with pytest.raises(SplatError, match="belong to 2 components") as caught:
+        read_cameras(in_components(tmp_path, [0, 0, 1, 1], placed))
+    assert caught.value.code == "cameras-unreadable"
+    assert "Align or merge the components" in caught.value.hint
+
+
+def test_two_components_of_identity_transforms_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(globals(), "COMPONENTS", ((np.eye(3), np.zeros(3), 1.0),) * 2)
+    with pytest.raises(SplatError, match="belong to 2 components"):
+        read_cameras(in_components(tmp_path, [0, 0, 1, 1]))
 
 
 def referenced(
