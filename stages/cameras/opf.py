@@ -34,8 +34,10 @@ from stages.cameras.nerfstudio import OPENGL_FROM_OURS
 from stages.scene.place import EarthPlace
 
 _SOURCE = "the scene reference frame"
-_CODE = re.compile(r'(?:^EPSG:([0-9]{4,6})|ID\["EPSG",\s*([0-9]{4,6})\]\s*\]\s*$)')
-_METRES = re.compile(r'LENGTHUNIT\["met(?:re|er)",\s*1(?:\.0*)?\b')
+_CODE = re.compile(r'EPSG:([0-9]{4,6})\b|ID\["EPSG",\s*([0-9]{4,6})\]')
+_UNIT = re.compile(r'\b(?:LENGTH)?UNIT\["[^"]*",\s*([0-9.eE+-]+)')
+_TOKEN = re.compile(r'"[^"]*"|[\[\],]')  # of WKT; a doubled quote gives two strings side by side
+_UTM = re.compile("32[67](?:0[1-9]|[1-5][0-9]|60)|258(?:2[89]|3[0-8])")  # of WGS 84 and ETRS89
 
 
 def locate(path: Path) -> Path | None:
@@ -153,19 +155,70 @@ def _world_to_camera(angles: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _georeference(frame: dict[str, Any]) -> Georeference:
-    """In metres and with a place where the frame is a projected system in metres; in metres where
-    it is a local one."""
+    """In the unit of the frame, with a place where it is a projected system in metres."""
     definition = str(frame["crs"]["definition"])
     to_canonical = frame["base_to_canonical"]
     shift = np.array(to_canonical["shift"], np.float64).reshape(3)
     if not np.isfinite(shift).all():
         raise BadFileError("the shift of its reference frame is not three numbers")
     if [float(value) for value in to_canonical["scale"]] != [1.0, 1.0, 1.0]:
-        return NO_GEOREFERENCE  # a unit other than the metre
-    code = _CODE.search(definition)
-    if code and not definition.startswith(("GEOG", "GEOD")):
-        place = EarthPlace(f"EPSG:{code[1] or code[2]}", -shift, np.eye(3))
-        return Georeference(1.0, np.eye(3), _SOURCE, place)
-    if definition.startswith("ENG") and _METRES.search(definition):
-        return Georeference(1.0, np.eye(3), _SOURCE)
-    return NO_GEOREFERENCE
+        return NO_GEOREFERENCE  # axes of different units
+    if definition.startswith("EPSG:"):
+        return _of_code(definition, -shift)
+    system = _cartesian(definition)
+    parts = _inside(system)
+    axes = [part for part in parts if part.startswith(("AXIS[", "LENGTHUNIT[", "UNIT["))]
+    units = {float(unit) for part in axes for unit in _UNIT.findall(part)}
+    codes = [part for part in parts if _CODE.fullmatch(part)]
+    if system.startswith("PROJ") and codes and units in (set(), {1.0}):
+        return _of_code(codes[-1], -shift, known=bool(units))
+    (factor,) = units if len(units) == 1 else (0.0,)
+    return Georeference(factor, np.eye(3), _SOURCE) if 0 < factor < math.inf else NO_GEOREFERENCE
+
+
+def _of_code(text: str, offset: NDArray[np.float64], known: bool = False) -> Georeference:
+    """Of the projected system whose code of EPSG the text names; without place if it is not in
+    metres. known: that it is in metres. Otherwise only UTM's is known without pyproj."""
+    found = _CODE.match(text)
+    code = (found[1] or found[2]) if found else ""
+    factor = 1.0 if known or _UTM.fullmatch(code) else _metres_per_unit(code)
+    if not factor:
+        return NO_GEOREFERENCE
+    place = EarthPlace(f"EPSG:{code}", offset, np.eye(3)) if factor == 1.0 else None
+    return Georeference(factor, np.eye(3), _SOURCE, place)
+
+
+def _metres_per_unit(code: str) -> float:
+    """Of a projected system; 0 if it is none, or if it is not known here."""
+    try:
+        import pyproj
+    except ImportError:
+        return 0.0
+    try:
+        system = pyproj.CRS.from_user_input(f"EPSG:{code}")
+    except pyproj.exceptions.CRSError:
+        return 0.0
+    units = {axis.unit_conversion_factor for axis in system.axis_info}
+    return float(*units) if system.is_projected and len(units) == 1 else 0.0
+
+
+def _cartesian(wkt: str) -> str:
+    """The projected or engineering system of WKT, which may be part of a compound one; "" if there
+    is none."""
+    wkt = wkt.strip()
+    parts = _inside(wkt) if wkt.startswith("COMPOUNDCRS") else [wkt]
+    return next((part for part in parts if part.startswith(("PROJ", "ENG"))), "")
+
+
+def _inside(wkt: str) -> list[str]:
+    """What is directly inside an element of WKT, in its order."""
+    depth = start = 0
+    found: list[str] = []
+    for token in _TOKEN.finditer(wkt):
+        depth += {"[": 1, "]": -1}.get(token[0], 0)
+        if token[0] == "[" and depth == 1:
+            start = token.end()
+        elif (token[0] == "," and depth == 1) or (token[0] == "]" and depth == 0):
+            found.append(wkt[start : token.start()].strip())
+            start = token.end()
+    return found

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stages.base.errors import SplatError
-from stages.cameras.camera_file import Georeference
+from stages.cameras.camera_file import NO_GEOREFERENCE, Georeference
 from stages.cameras.camera_formats import read_cameras
 from stages.scene.place import GEOGRAPHIC, geocentric
 from tests.cameras.drawn import CHUNK, EYES, POSES, metashape, opensfm
@@ -204,31 +206,104 @@ def test_phones_are_in_metres_with_their_up_and_no_place(tmp_path: Path, read: A
     np.testing.assert_array_equal(ground.axes[2], [0, 1, 0])
 
 
+FEET = 'LENGTHUNIT["US survey foot",0.304800609601219]'
+LONG_ISLAND = (
+    'PROJCRS["NAD83 / New York Long Island (ftUS)",BASEGEOGCRS["NAD83",DATUM["D",'
+    'ELLIPSOID["GRS 1980",6378137,298.257222101,LENGTHUNIT["metre",1]]],ID["EPSG",4269]],'
+    'CONVERSION["zone",METHOD["Lambert Conic Conformal (2SP)",ID["EPSG",9802]],'
+    f'PARAMETER["Easting at false origin",984250,{FEET},ID["EPSG",8826]]],CS[Cartesian,2],'
+    f'AXIS["(X)",east,ORDER[1],{FEET}],\n  AXIS["(Y)",north,ORDER[2],{FEET}],ID["EPSG",2263]]'
+)
+EGM96 = (
+    'VERTCRS["EGM96 height",VDATUM["EGM96 geoid"],CS[vertical,1],AXIS["gravity-related height (H)",'
+    'up,LENGTHUNIT["metre",1]],ID["EPSG",5773]]'
+)
+# without a code, and with a parameter in feet
+GRID = LONG_ISLAND.partition("CS[")[0] + (
+    'CS[Cartesian,2],AXIS["(X)",east],AXIS["(Y)",north],LENGTHUNIT["metre",1]]'
+)
+
+
+def framed(folder: Path, definition: str) -> Georeference:
+    """Of an OPF project whose reference frame is so defined."""
+    path = opf(folder)
+    frame = folder / "scene-reference-frame.json"
+    frame.write_text(
+        json.dumps(json.loads(frame.read_text()) | {"crs": {"definition": definition}})
+    )
+    return read_cameras(path).georeference
+
+
 @pytest.mark.parametrize(
     ("definition", "crs"),
     [
         (UTM32, "EPSG:32632"),
+        (f'COMPOUNDCRS["UTM zone 32N, ""EGM96"" [m]",{UTM32},{EGM96}]', "EPSG:32632"),
         ("EPSG:32632", "EPSG:32632"),
         ("EPSG:32632+5773", "EPSG:32632"),
+        ("EPSG:32632+EPSG:5773", "EPSG:32632"),
+        (GRID, None),
         ('ENGCRS["Site",EDATUM["Corner"],CS[Cartesian,3],LENGTHUNIT["metre",1.0]]', None),
     ],
 )
+@pytest.mark.parametrize("pyproj", [True, False])
 def test_opfs_reference_frame_is_the_place_of_its_world(
-    tmp_path: Path, definition: str, crs: str | None
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, definition: str, crs: str | None, pyproj: bool
 ) -> None:
-    path = opf(tmp_path)
-    frame = tmp_path / "scene-reference-frame.json"
-    frame.write_text(
-        json.dumps(json.loads(frame.read_text()) | {"crs": {"definition": definition}})
-    )
-    ground = read_cameras(path).georeference
+    if not pyproj:
+        monkeypatch.setitem(sys.modules, "pyproj", None)
+    ground = framed(tmp_path, definition)
     assert ground.metres_per_unit == 1.0
     assert (ground.place.crs if ground.place else None) == crs
     if ground.place:
         np.testing.assert_array_equal(ground.place.offset, np.negative(SHIFT))
 
 
-def test_opf_in_feet_is_arbitrary(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "definition",
+    [
+        LONG_ISLAND,
+        f'COMPOUNDCRS["c",{LONG_ISLAND},{EGM96}]',
+        f'ENGCRS["Site",EDATUM["Corner"],CS[Cartesian,3],AXIS["x",east],{FEET}]',
+    ],
+)
+def test_opfs_unit_is_that_of_its_axes(tmp_path: Path, definition: str) -> None:
+    """A place would be taken to be in metres."""
+    ground = framed(tmp_path, definition)
+    assert (ground.metres_per_unit, ground.place) == (0.304800609601219, None)
+
+
+@pytest.mark.parametrize("code", ["EPSG:2263", "EPSG:2263+6360"])
+def test_opfs_code_of_a_system_in_feet_is_not_in_metres(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str
+) -> None:
+    if importlib.util.find_spec("pyproj"):
+        ground = framed(tmp_path / "known", code)
+        assert ground.metres_per_unit == pytest.approx(0.304800609601219, rel=1e-12)
+        assert ground.place is None
+    monkeypatch.setitem(sys.modules, "pyproj", None)
+    assert framed(tmp_path, code) == NO_GEOREFERENCE
+
+
+@pytest.mark.parametrize(
+    "definition",
+    [
+        "EPSG:4326+5773",
+        "EPSG:999999",
+        "ESRI:102001",
+        "EPSG:",
+        'GEOGCRS["WGS 84",CS[ellipsoidal,3],AXIS["h",up,LENGTHUNIT["metre",1]],ID["EPSG",4979]]',
+        'PROJCRS["p",AXIS["x",east,LENGTHUNIT["metre",1]],AXIS["y",north,LENGTHUNIT["foot",0.3]]]',
+        'PROJCRS["p",AXIS["x",east,LENGTHUNIT["metre",0]]]',
+        'PROJCRS["p",AXIS["x",east,LENGTHUNIT["metre",1e999]]]',
+        'PROJCRS["truncated',
+    ],
+)
+def test_opfs_frame_that_states_no_length_is_arbitrary(tmp_path: Path, definition: str) -> None:
+    assert framed(tmp_path, definition) == NO_GEOREFERENCE
+
+
+def test_opf_with_axes_of_different_units_is_arbitrary(tmp_path: Path) -> None:
     path = opf(tmp_path)
     frame = tmp_path / "scene-reference-frame.json"
     frame.write_text(frame.read_text().replace("[1, 1, 1]", "[0.3048, 0.3048, 1]"))
