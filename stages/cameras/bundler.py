@@ -1,11 +1,13 @@
 """Bundler's bundle.out: https://www.cs.cornell.edu/~snavely/bundler/bundler-v0.4-manual.html
 
 World to camera, x right, y up, z backward. The principal point is the middle of the picture, and
-pixels relative to it are f (1 + k1 r^2 + k2 r^4) p. A file beside it (list.txt) lists the pictures.
+pixels relative to it are f (1 + k1 r^2 + k2 r^4) p. A file beside it (list.txt; X.list.txt for
+COLMAP's X.bundle.out) lists the pictures. A zero and a focal length may follow a name there.
 """
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +26,7 @@ from stages.cameras.lens import Lens
 from stages.cameras.nerfstudio import OPENGL_FROM_OURS
 
 _CAMERA_LINES = 5
+_FOCAL = re.compile(r"\s+0\s+[0-9.eE+-]+\s*$")
 
 
 def read(path: Path) -> CameraFile:
@@ -82,7 +85,7 @@ def files(path: Path) -> list[Path]:
 
 
 def _names(path: Path) -> list[str]:
-    """The first word of each line of the list of pictures."""
+    """The name in each line of the list of pictures; it may hold spaces."""
     file_of_names = _file_of_names(path)
     if file_of_names is None:
         raise BadFileError(
@@ -91,10 +94,11 @@ def _names(path: Path) -> list[str]:
             "order of the cameras.",
         )
     lines = file_of_names.read_text(encoding="utf-8").splitlines()
-    return [line.split()[0] for line in lines if line.strip()]
+    return [_FOCAL.sub("", line).strip() for line in lines if line.strip()]
 
 
 def _file_of_names(path: Path) -> Path | None:
-    near = (path.with_suffix(".txt"), path.parent / "list.txt", path.parent.parent / "list.txt",
+    near = (path.with_suffix(".txt"), path.with_suffix("").with_suffix(".list.txt"),
+            path.parent / "list.txt", path.parent.parent / "list.txt",
             path.with_name(f"{path.name}.list.txt"))  # fmt: skip
     return next((file for file in near if file.is_file()), None)

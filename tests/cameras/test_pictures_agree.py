@@ -24,6 +24,7 @@ from tests.cameras.drawn import (
     COLOURS,
     EYES,
     HEIGHT,
+    NAMES,
     POINTS,
     POSES,
     WIDTH,
@@ -206,6 +207,33 @@ def test_bundlers_missing_list_may_be_written(tmp_path: Path) -> None:
     with pytest.raises(SplatError, match="no list of pictures") as caught:
         read_cameras(path)
     assert f"Write {tmp_path / 'list.txt'}" in caught.value.hint
+
+
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [
+        ("IMG 1.jpg", "IMG 1.jpg"),
+        ("IMG 1.jpg", "IMG 1.jpg 0 532.1\r"),
+        ("IMG_1.jpg", "IMG_1.jpg 0 532.1"),
+        ("IMG_1.jpg", " IMG_1.jpg\t0 5.321e+02 "),
+        ("day 2/IMG 1.jpg", "day 2/IMG 1.jpg"),
+    ],
+)
+def test_names_in_bundlers_list_may_hold_spaces(tmp_path: Path, name: str, line: str) -> None:
+    path = MADE["bundler"](tmp_path)
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / "p_1.png").rename(tmp_path / name)
+    names = (tmp_path / "list.txt").read_text()
+    (tmp_path / "list.txt").write_text(names.replace("p_1.png", line))
+    assert [view.name for view in read_cameras(path).views] == ["p_0.png", name, *NAMES[2:]]
+
+
+def test_colmaps_names_of_bundlers_files_are_found(tmp_path: Path) -> None:
+    path = MADE["bundler"](tmp_path).rename(tmp_path / "model.bundle.out")
+    (tmp_path / "list.txt").rename(tmp_path / "model.list.txt")
+    (tmp_path / "list.txt").write_text("another.png\n")
+    assert len(read_cameras(path).views) == len(POSES)
+    assert {file.name for file in files_of(path)} == {"model.bundle.out", "model.list.txt"}
 
 
 @pytest.mark.parametrize("name", ["cameras.json", "cameras.xml", "cameras.csv", "cameras.out"])
