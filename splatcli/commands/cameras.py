@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,8 +13,8 @@ from splatcli import console
 from stages.base.atomic import make_folder
 from stages.base.errors import SplatError, UsageError
 from stages.cameras import colmap, nerfstudio
-from stages.cameras.camera_file import NO_POINTS, CameraFile
-from stages.cameras.camera_formats import read_cameras
+from stages.cameras.camera_file import NO_POINTS, CameraFile, FilePoints
+from stages.cameras.camera_formats import read_cameras, read_points
 from stages.run import runfolder
 from stages.run.pipeline import Pipeline
 
@@ -29,16 +30,14 @@ def cameras(
     """Write cameras for other programs: those of a run, of nerfstudio or of COLMAP.
 
     A run's cameras belong to its undistorted photographs, which the file names; sparse points are
-    written with them. nerfstudio's world is z up; COLMAP's is y down, as in a run.
+    written with them. nerfstudio's world is z up, also that of a transforms.json without
+    applied_transform; COLMAP's is y down, as in a run. Other sources are taken to be y down.
     """
     to_nerfstudio = _is_json(out)
     source = _model_of_run(source) if runfolder.is_run_folder(source) else source
     model = colmap.locate(source)
     _check_other(out, source if model is None else model)
-    if model is None:
-        found, cloud, observations = read_cameras(source), NO_POINTS, colmap.NO_OBSERVATIONS
-    else:
-        found, cloud, observations = colmap.read_model(model)
+    found, cloud, observations = colmap.read_model(model) if model else _read(source)
     if found.distorted:
         raise SplatError(
             "cameras-distorted",
@@ -64,6 +63,15 @@ def cameras(
         "pictures_found": (found.folder / found.views[0].image).is_file(),
     }
     _print(facts)
+
+
+def _read(source: Path) -> tuple[CameraFile, FilePoints, colmap.Observations]:
+    """(cameras, points, no observations) of a file; a world that is z up is turned y down."""
+    found, cloud = read_cameras(source), read_points(source) or NO_POINTS
+    if found.z_up:
+        views, points = nerfstudio.y_down(found.views, cloud.points)
+        found, cloud = replace(found, views=views), replace(cloud, points=points)
+    return found, cloud, colmap.NO_OBSERVATIONS
 
 
 def _print(facts: dict[str, Any]) -> None:
@@ -94,13 +102,15 @@ def _is_json(out: Path) -> bool:
 def _check_other(out: Path, source: Path) -> None:
     """Raise SplatError where cameras would be written onto those that are read: what only the
     source holds, as its roles and units, would be lost."""
-    if out.exists() and source.exists() and out.samefile(source):
-        raise UsageError(
-            "target-is-source",
-            given=f"{out} is what is read.",
-            wanted="Another name.",
-            hint=f"For example {out.with_name('new-' + out.name)}",
-        )
+    read = nerfstudio.files(source) if source.suffix.lower() == ".json" else [source]
+    for target in (out, nerfstudio.points_beside(out)):
+        if target.exists() and any(file.exists() and target.samefile(file) for file in read):
+            raise UsageError(
+                "target-is-source",
+                given=f"{target} is what is read.",
+                wanted="Another name.",
+                hint=f"For example {out.with_name('new-' + out.name)}",
+            )
 
 
 def _model_of_run(run: Path) -> Path:

@@ -34,6 +34,7 @@ def read(folder: Path) -> CameraFile:
         tuple(replace(view, role=name) for name, part in parts for view in part.views),
         folder,
         tuple(lens for _, part in parts for lens in part.lenses),
+        z_up=all(part.z_up for _, part in parts),
     )
 
 

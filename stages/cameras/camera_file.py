@@ -63,12 +63,14 @@ class CameraFile:
         folder: that `View.image` is relative to.
         lenses: V lenses, the distortion of each view.
         georeference: of the file's world.
+        z_up: the world is nerfstudio's or instant-ngp's own, whose z axis points up.
     """
 
     views: tuple[View, ...]
     folder: Path
     lenses: tuple[Lens, ...]
     georeference: Georeference = NO_GEOREFERENCE
+    z_up: bool = False
 
     @property
     def distorted(self) -> int:

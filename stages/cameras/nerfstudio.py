@@ -79,7 +79,7 @@ def write(
     if shared:
         data |= lenses[0]
     if points is not None and colours is not None and len(points):
-        beside = path.with_name(f"{path.stem}_points.ply")  # X.ply may hold the splats of X.json
+        beside = points_beside(path)
         _write_points(beside, points @ APPLIED_TRANSFORM.T, colours)
         data["ply_file_path"] = beside.name
     data["frames"] = [
@@ -92,6 +92,24 @@ def write(
     ]
     with replacing(path) as partial:
         partial.write_text(json.dumps(data, indent=1, ensure_ascii=False), encoding="utf-8")
+
+
+def points_beside(path: Path) -> Path:
+    """The file that `write` gives the points of the cameras in `path`."""
+    return path.with_name(f"{path.stem}_points.ply")  # X.ply may hold the splats of X.json
+
+
+def y_down(
+    views: Sequence[View], points: NDArray[np.float64]
+) -> tuple[tuple[View, ...], NDArray[np.float64]]:
+    """(views, points [P, 3]) of a world that is z up, in the world that `write` turns into it."""
+    turn = np.eye(4)
+    turn[:3, :3] = APPLIED_TRANSFORM
+    cameras = [
+        replace(view.camera, world_to_camera=view.camera.world_to_camera @ turn) for view in views
+    ]
+    turned = (replace(view, camera=camera) for view, camera in zip(views, cameras, strict=True))
+    return tuple(turned), points @ APPLIED_TRANSFORM
 
 
 def read(path: Path, size: tuple[int, int] | None = None) -> CameraFile:
@@ -111,7 +129,8 @@ def read(path: Path, size: tuple[int, int] | None = None) -> CameraFile:
             row[:] = np.array(required(frame, "transform_matrix"), np.float64)[:3]
         names = [str(required(frame, "file_path")) for frame in frames]
         cameras = camera_file(path.parent, names, optics, _our_poses(data, saved))
-        return replace(cameras, views=_with_roles(cameras.views, data))
+        z_up = np.array_equal(_applied(data)[0], np.eye(3))
+        return replace(cameras, views=_with_roles(cameras.views, data), z_up=z_up)
 
 
 def read_points(path: Path) -> FilePoints | None:
