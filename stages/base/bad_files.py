@@ -44,7 +44,7 @@ SPLATS = FileKind(
 CAMERAS = FileKind(
     "cameras-unreadable",
     "cameras",
-    "A whole file of cameras in one of the formats that README.md lists.",
+    "A whole file of cameras in one of the formats that docs/guide/captures.md lists.",
     "Export the cameras again; a run's own are written by `splat cameras RUN OUT`.",
 )
 

@@ -17,6 +17,7 @@ import pillow_heif
 import pytest
 from PIL import Image
 
+from stages.base.bad_files import CAMERAS
 from stages.base.errors import SplatError
 from stages.cameras.camera_formats import CAMERA_FILES, files_of, read_cameras, read_points
 from tests.cameras import drawn, drawn_surveys
@@ -37,6 +38,13 @@ from tests.cameras.models import example
 
 def test_every_format_of_the_table_is_drawn() -> None:
     assert set(MADE) == {row.read.__module__.rpartition(".")[2] for row in CAMERA_FILES}
+
+
+def test_the_page_that_the_error_names_lists_every_format() -> None:
+    found = re.search(r"formats that (\S+\.md) lists", CAMERAS.wanted)
+    assert found
+    page = (Path(__file__).parents[2] / found[1]).read_text(encoding="utf-8")
+    assert [row.description for row in CAMERA_FILES if row.description not in page] == []
 
 
 @pytest.mark.parametrize("name", [*MADE, "polycam"])
