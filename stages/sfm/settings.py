@@ -94,7 +94,7 @@ class SfmSettings:
 
 STAGE = Stage(
     "sfm",
-    version=28,
+    version=29,
     reads=("ingest",),
     settings_type=SfmSettings,
     **in_module("stages.sfm.stage"),
