@@ -334,16 +334,40 @@ def test_a_time_limit_is_an_error(tmp_path: Path) -> None:
     assert error.code == "sfm-timed-out"
 
 
-def test_stopping_leaves_work_to_go_on_with(tmp_path: Path) -> None:
+def interrupted(capture: Capture, folder: Path, settings: SfmSettings = FEW) -> None:
+    """Stop the stage when it begins to match."""
     report = Report()
     report.stop_requested = Event()
     report.listener = lambda label, done, total, numbers: (
         report.stop_requested.set() if label == "matching" else None
     )
     with pytest.raises(Interrupted):
-        sfm.run({"ingest": bad_captures.sample(5)}, FEW, tmp_path, report)
+        sfm.run({"ingest": capture}, settings, folder, report)
+
+
+def test_stopping_leaves_work_to_go_on_with(tmp_path: Path) -> None:
+    interrupted(bad_captures.sample(5), tmp_path)
     assert (tmp_path / "work" / "base.features-done").exists()
     assert not (tmp_path / "sfm.json").exists()
+
+
+def damage_database(path: Path, how: str) -> None:
+    """What a power cut leaves, since COLMAP does not wait for the disk."""
+    content = path.read_bytes()
+    assert len(content) > 65536
+    path.write_bytes(b"" if how == "empty" else bytes(8192) + content[8192:])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ["empty", "header"])
+def test_a_damaged_database_is_made_again(
+    small: tuple[Reconstruction, Report, Path], tmp_path: Path, how: str
+) -> None:
+    interrupted(bad_captures.sample(9), tmp_path)
+    (tmp_path / "work" / "base.auto-done").touch()  # as after matching
+    damage_database(tmp_path / "work" / "base.db", how)
+    sfm.run({"ingest": bad_captures.sample(9)}, FEW, tmp_path, Report())
+    assert digests(tmp_path) == digests(small[2])
 
 
 @pytest.mark.parametrize("damage", ["points.npy", "reconstruction.json"])

@@ -18,6 +18,7 @@ from stages.scene.rotations import quaternions_of
 from stages.sfm import stage as sfm
 from stages.sfm.settings import SfmSettings
 from tests.sfm.checks import bad_captures
+from tests.sfm.test_stage import damage_database, digests, interrupted
 from tests.sfm.truth import TRUTH, centres, off_by, similarity
 
 POSES = {
@@ -67,6 +68,21 @@ def test_given_cameras_are_kept_and_points_are_triangulated(tmp_path: Path) -> N
     views = sfm.load(tmp_path / "sfm").views
     assert [view.name for view in views] == [view.name for view in found.views]
     assert not (tmp_path / "sfm" / "work").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ["empty", "header"])
+def test_a_damaged_database_is_made_again(tmp_path: Path, how: str) -> None:
+    cameras = model(tmp_path / "cameras", lambda pose: pose, 5)
+    reconstructed(tmp_path / "whole", cameras)
+    settings = SfmSettings(max_features=1000, cameras=cameras)
+    interrupted(bad_captures.sample(5), tmp_path / "sfm", settings)
+    work = tmp_path / "sfm" / "work"
+    assert (work / "features.done").exists()
+    (work / "neighbours.done").touch()  # as after matching
+    damage_database(work / "known.db", how)
+    reconstructed(tmp_path / "sfm", cameras)
+    assert digests(tmp_path / "sfm") == digests(tmp_path / "whole")
 
 
 @pytest.mark.slow

@@ -28,7 +28,16 @@ from stages.sfm.checks.gates import (
 )
 from stages.sfm.checks.statistics import model_statistics
 from stages.sfm.worker import database as sqlite
-from stages.sfm.worker.job import Features, Job, Learned, Mapping, Matching, Project, Sift
+from stages.sfm.worker.job import (
+    Features,
+    Job,
+    Learned,
+    Mapping,
+    Matching,
+    Project,
+    Sift,
+    derived_paths,
+)
 from stages.sfm.worker.process import WorkerCrashed, WorkerTimedOut, run_step
 from stages.sfm.worker.sparse_model import load_result, without_implausible_views
 
@@ -137,8 +146,9 @@ class AttemptRunner:
             most = round(sift.max_features * MORE_FEATURES)
             sift = Sift(most, sift.peak_threshold * LOWER_PEAK)
         marker = project.database.with_suffix(".features-done")
-        if not (marker.exists() and project.database.exists()):
-            sqlite.repair_or_delete(project.database)
+        matched = (_matched_marker(project.database, how) for how in ("auto", "exhaustive"))
+        sqlite.usable(project.database, marker, *matched, *derived_paths(project.database))
+        if not marker.exists():
             self._run(Features(project, sift))
             marker.touch()
         return project
@@ -146,12 +156,10 @@ class AttemptRunner:
     def _with_matches(self, project: Project, configuration: Configuration) -> Project:
         """Match; returns the project with the database of the two-view geometries to use."""
         how = "exhaustive" if configuration.more_features else "auto"
-        marker = project.database.with_suffix(f".{how}-done")
-        if marker.exists() and project.database.exists():
-            return project
-        sqlite.repair(project.database)
-        self._run(Matching(project, how))
-        marker.touch()
+        marker = _matched_marker(project.database, how)
+        if not marker.exists():
+            self._run(Matching(project, how))
+            marker.touch()
         return project
 
     def _with_learned(self, project: Project) -> Project:
@@ -159,7 +167,7 @@ class AttemptRunner:
         returns the project with the database of both."""
         source = project.database
         project = replace(project, database=source.with_name(f"{source.stem}-learned.db"))
-        if not project.database.exists():  # it appears when it is complete
+        if not sqlite.usable(project.database):  # it appears when it is complete
             self._run(Learned(project, source, self._unregistered(source)))
         return project
 
@@ -201,6 +209,11 @@ class AttemptRunner:
         finally:
             spent = self.seconds.get(job.step, 0.0) + time.monotonic() - started
             self.seconds[job.step] = spent
+
+
+def _matched_marker(database: Path, how: str) -> Path:
+    """The file that says that a database is matched. how: as in `job.Matching`."""
+    return database.with_suffix(f".{how}-done")
 
 
 def mapping_seconds(photographs: int) -> float:

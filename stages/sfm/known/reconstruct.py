@@ -42,6 +42,7 @@ from stages.sfm.worker.job import (
     Project,
     Sift,
     Triangulation,
+    derived_paths,
     prepare_work_folder,
 )
 from stages.sfm.worker.pairs import Pair
@@ -196,14 +197,15 @@ def _match(
     Returns the folder that the last step writes. deadline: of `time.monotonic`."""
     sift, refine, out = Sift(settings.max_features), settings.refine_cameras, work / "known"
     prepare_work_folder(work, project, sift, known, pairs, refine)
-    for job in (
+    jobs = (
         Features(project, sift),
         Neighbours(project, known, pairs),
         Triangulation(project, out, known, refine),
-    ):
-        marker = work / f"{job.step}.done"
+    )
+    markers = [work / f"{job.step}.done" for job in jobs]
+    sqlite.usable(project.database, *markers, *derived_paths(project.database))
+    for job, marker in zip(jobs, markers, strict=True):
         if not marker.exists():
-            sqlite.repair_or_delete(project.database)
             run_step(job, work, report, deadline - time.monotonic())
             marker.touch()
     return out

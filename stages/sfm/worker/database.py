@@ -73,13 +73,30 @@ def repair(database: Path) -> None:
         connection.commit()
 
 
-def repair_or_delete(database: Path) -> None:
-    """`repair` the database if there is one; delete it if that fails."""
+def usable(database: Path, *dependents: Path) -> bool:
+    """Whether the database is there and whole, after `repair`. If not, it is deleted, and the files
+    `dependents` that tell what it holds with it.
+
+    COLMAP does not wait for the disk, so a power cut can leave a database with missing pages.
+    """
     if database.exists():
         try:
             repair(database)
+            _check_pages(database)
+            return True
         except sqlite3.DatabaseError:
             delete(database)
+    for path in dependents:
+        path.unlink(missing_ok=True)
+    return False
+
+
+def _check_pages(database: Path) -> None:
+    """Raises sqlite3.DatabaseError if pages of the file are damaged."""
+    with closing(_open_read_only(database)) as connection:
+        found = connection.execute("PRAGMA quick_check(1)").fetchone()[0]
+    if found != "ok":
+        raise sqlite3.DatabaseError(found)
 
 
 class StoredFeatures:

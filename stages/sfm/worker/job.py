@@ -271,3 +271,8 @@ def similarity_path(database: Path) -> Path:
 def vocabulary_path(database: Path) -> Path:
     """File with the vocabulary of the features in `database`: [W, 128]."""
     return database.with_suffix(".vocabulary.npy")
+
+
+def derived_paths(database: Path) -> tuple[Path, ...]:
+    """Files beside a database that are computed from its features."""
+    return similarity_path(database), vocabulary_path(database)

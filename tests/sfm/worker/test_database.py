@@ -53,3 +53,28 @@ def test_a_file_that_is_no_database_raises_and_can_be_deleted(tmp_path: Path) ->
         sqlite.repair(garbage)
     sqlite.delete(garbage)
     assert not garbage.exists()
+
+
+@pytest.mark.parametrize("damage", ["garbage", "empty", "pages", "missing"])
+def test_a_damaged_database_takes_the_files_along_that_say_what_it_holds(
+    tmp_path: Path, damage: str
+) -> None:
+    path, markers = make(tmp_path / "a.db"), [tmp_path / "a.done", tmp_path / "never.done"]
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute("CREATE TABLE data (content BLOB)")
+        connection.execute("INSERT INTO data VALUES (?)", (b"x" * 100_000,))
+        connection.commit()
+    markers[0].touch()
+    assert sqlite.usable(path, *markers)
+    assert path.exists()
+    assert markers[0].exists()
+    content = path.read_bytes()
+    middle = len(content) - 50_000
+    pages = content[:middle] + bytes(8192) + content[middle + 8192 :]
+    damaged = {"garbage": b"no database" * 100, "empty": b"", "pages": pages}
+    if damage == "missing":
+        path.unlink()
+    else:
+        path.write_bytes(damaged[damage])
+    assert not sqlite.usable(path, *markers)
+    assert list(tmp_path.iterdir()) == []
