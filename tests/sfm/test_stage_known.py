@@ -203,6 +203,26 @@ def test_opengl_axes_where_a_model_has_others_are_refused(tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
+def test_cameras_for_pixels_that_exif_has_turned_are_named(tmp_path: Path) -> None:
+    """Two of nine photographs were taken upside down, and their cameras are for stored pixels."""
+    turned = list(POSES)[0], list(POSES)[8]
+    cameras = model(tmp_path / "cameras", lambda pose: pose, 9)
+    poses = [np.diag([-1.0, -1.0, 1.0, 1.0]) @ POSES[name] for name in turned]
+    text = (cameras / "images.txt").read_text().split("\n")
+    for name, pose in zip(turned, poses, strict=True):
+        (line,) = [i for i, words in enumerate(text) if words.endswith(f" {name}")]
+        words = [*text[line].split()[:1], *quaternions_of(pose[:3, :3]), *pose[:3, 3], 1, name]
+        text[line] = " ".join(map(str, words))
+    (cameras / "images.txt").write_text("\n".join(text))
+    _, report = reconstructed(tmp_path / "sfm", cameras, 9)
+    assert report.metrics["epipolar_inlier_ratio"] > 0.5
+    ((code, message),) = report.warnings
+    assert code == "cameras-some-do-not-fit"
+    assert f"2 of 9 photographs do not fit their cameras: {', '.join(turned)}." in message
+    assert f"Turned by 180 degrees they would fit: {', '.join(turned)}." in message
+
+
+@pytest.mark.slow
 def test_the_test_photographs_of_a_split_are_held_out_and_give_no_points(tmp_path: Path) -> None:
     path = tmp_path / "transforms.json"
     names = split_file(path)

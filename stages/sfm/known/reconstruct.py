@@ -7,7 +7,7 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from stages.base import threads
 from stages.base.errors import ReconstructionError, SplatError, UsageError
 from stages.base.stage import Report
-from stages.base.text import counted
+from stages.base.text import counted, listed
 from stages.cameras.camera_file import FilePoints
 from stages.cameras.camera_formats import read_cameras, read_points
 from stages.cameras.colmap import Observations
 from stages.scene import Capture, Photo, Reconstruction
 from stages.scene.rotations import quaternions_of
 from stages.sfm.finish import COLMAP, write_reconstruction
-from stages.sfm.known.epipolar import PoseCheck
+from stages.sfm.known.epipolar import MISFIT_RATIO, PoseCheck
 from stages.sfm.known.match_cameras import match_cameras
 from stages.sfm.known.pinhole_views import PinholeView, write_pinhole_views
 from stages.sfm.known.points import find_points
@@ -94,7 +94,9 @@ def reconstruct(
     pairs = neighbours(known.world_to_camera, turns, project.photographs.frames)
     out = _match(project, known, tuple(pairs), settings, work, deadline, report)
     check = json.loads((out / "pose_check.json").read_text(encoding="utf-8"))
-    _check_poses(PoseCheck(**check), settings, report)
+    sources = (view.photo.source for view in chosen)
+    names = dict(zip(project.photographs.frame_of, sources, strict=True))
+    _check_poses(PoseCheck(**check), names, settings, report)
     if settings.refine_cameras:
         views = chosen = _refined(views, out / POINTS, report)  # none is for testing
     cameras = [view.camera for view in chosen]
@@ -227,8 +229,10 @@ def _refined(views: Sequence[PinholeView], path: Path, report: Report) -> list[P
     return [replace(view, camera=camera) for view, camera in zip(views, moved, strict=True)]
 
 
-def _check_poses(check: PoseCheck, settings: SfmSettings, report: Report) -> None:
-    """Refuse poses that do not fit the matches."""
+def _check_poses(
+    check: PoseCheck, names: Mapping[int, str], settings: SfmSettings, report: Report
+) -> None:
+    """Refuse poses that do not fit the matches. names: of the photographs, by number of frame."""
     ratio = check.given
     if settings.refine_cameras:
         report.metric("epipolar_inlier_ratio_before", None if ratio is None else round(ratio, 4))
@@ -242,6 +246,7 @@ def _check_poses(check: PoseCheck, settings: SfmSettings, report: Report) -> Non
         )
         return
     if ratio >= INLIER_RATIO:
+        _warn_misfits(check, names, report)
         return
     if (check.rough or 0.0) >= ROUGH_INLIER_RATIO:
         report.warn(
@@ -262,6 +267,30 @@ def _check_poses(check: PoseCheck, settings: SfmSettings, report: Report) -> Non
     if not settings.allow_partial:
         raise error
     report.warn(error.code, f"Accepted because of --allow-partial: {error.given}")
+
+
+def _warn_misfits(check: PoseCheck, names: Mapping[int, str], report: Report) -> None:
+    """Name the photographs whose own cameras do not fit, while most others do."""
+    if not check.misfits:
+        return
+    message = (
+        f"{len(check.misfits)} of {counted(len(names), 'photograph')} do not fit their cameras: "
+        f"{listed([names[frame] for frame in check.misfits])}. Less than {MISFIT_RATIO:.0%} of "
+        "their matches lie where the cameras predict them. "
+    )
+    if check.upside_down:
+        turned = listed([names[frame] for frame in check.upside_down])
+        message += (
+            f"Turned by 180 degrees they would fit: {turned}. Their EXIF orientation turns them, "
+            "and their cameras are for the pixels as stored: rotate the pixels themselves, and "
+            "estimate the cameras again. "
+        )
+    if len(check.upside_down) < len(check.misfits):
+        message += (
+            "Check that the cameras were estimated from these photographs. If you remove them, "
+            "--allow-partial goes on with the others."
+        )
+    report.warn("cameras-some-do-not-fit", message.rstrip())
 
 
 def _finish(

@@ -17,9 +17,13 @@ from stages.cameras.camera_file import poses_of
 from stages.scene.rotations import similarity
 from stages.sfm.known.epipolar import (
     INLIER_DISTANCE,
+    ROUGH,
     PoseCheck,
     epipolar_distances,
+    inlier_ratios,
     median_inlier_ratio,
+    misfits,
+    upside_down,
 )
 from stages.sfm.worker.job import CameraGuess, KnownCameras, Neighbours, Project, Triangulation
 from stages.sfm.worker.mapping import point_arrays
@@ -28,7 +32,6 @@ from stages.sfm.worker.pair_checks import verified_matches
 from stages.sfm.worker.pairs import Pair
 from stages.sfm.worker.sparse_model import camera_centres
 
-ROUGH = 4.0  # x the distance of inliers, for rough poses
 FITTING = 0.5  # of the matches of a pair must fit the poses to be believed; by chance 1 % do
 # Factor on COLMAP's error thresholds of triangulation, for each round of refinement: with the usual
 # thresholds, rough poses give no points to begin with.
@@ -84,6 +87,10 @@ def triangulate(job: Triangulation) -> None:
     if job.refine:
         poses = _refined(job, out / "colmap")
         check = replace(check, refined=median_inlier_ratio(pairs, lens, poses, side))
+    bad = misfits(pairs, inlier_ratios(pairs, lens, poses, side), photographs.frame_of)
+    sizes = np.array([(camera.width, camera.height) for camera in photographs.cameras], np.float64)
+    turned = upside_down(pairs, lens, poses, sizes, photographs.frame_of, bad)
+    check = replace(check, misfits=bad, upside_down=turned)
     (out / "pose_check.json").write_text(json.dumps(vars(check)), encoding="utf-8")
     _save_points(_triangulated(job, poses, out / "colmap"), poses, out / "points.npz")
 
