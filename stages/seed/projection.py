@@ -13,7 +13,7 @@ def visible_points(
 ) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
     """(indices [K] of the points that project into the picture, pixels [K, 2], depths [K])."""
     pixels, z = camera.project(points)
-    rows = np.flatnonzero((z > 1e-6) & camera.shows(pixels))
+    rows = np.flatnonzero((z > 0) & camera.shows(pixels))
     return rows, pixels[rows], z[rows]
 
 

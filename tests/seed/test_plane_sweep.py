@@ -1,5 +1,6 @@
 """Plane sweep: points lie on surfaces with texture."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -45,6 +46,19 @@ def test_the_order_of_the_photographs_decides_nothing(found) -> None:
     again, again_colours = plane_sweep_points(folder, views[::-1], points)
     assert again.tobytes() == more.tobytes()
     assert again_colours.tobytes() == colours.tobytes()
+
+
+@pytest.mark.parametrize("unit", [2.0**-24, 2.0**24])
+def test_the_unit_of_the_world_decides_nothing(found, unit: float) -> None:
+    folder, views, points, more, _ = found
+    scaled = []
+    for view in views:
+        pose = view.camera.world_to_camera.copy()
+        pose[:3, 3] *= unit
+        scaled.append(replace(view, camera=replace(view.camera, world_to_camera=pose)))
+    again, _ = plane_sweep_points(folder, tuple(scaled), points * unit)
+    assert len(again) == len(more)
+    np.testing.assert_allclose(again / unit, more, rtol=1e-6)
 
 
 def test_plain_surfaces_give_no_points(tmp_path: Path) -> None:
