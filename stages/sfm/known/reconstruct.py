@@ -281,9 +281,9 @@ def _warn_misfits(check: PoseCheck, names: Mapping[int, str], report: Report) ->
     if check.upside_down:
         turned = listed([names[frame] for frame in check.upside_down])
         message += (
-            f"Turned by 180 degrees they would fit: {turned}. Their EXIF orientation turns them, "
-            "and their cameras are for the pixels as stored: rotate the pixels themselves, and "
-            "estimate the cameras again. "
+            f"Turned by 180 degrees they would fit: {turned}. A camera is so where EXIF turns a "
+            "photograph and the camera is for the pixels as stored: rotate the pixels themselves, "
+            "and estimate the cameras again. "
         )
     if len(check.upside_down) < len(check.misfits):
         message += (
