@@ -20,6 +20,9 @@ from stages.scene.place import (
 from stages.sfm.place.gps import MetricScale, about_vertical
 
 _STEP_M = 50.0  # of the differences that give the axes of the grid
+# Of lengths in the grid, relative. Zones of UTM and of most countries stretch less than 0.3 %.
+_LARGEST_STRETCH = 0.005
+_UTM_LATITUDES = (-80.0, 84.0)
 
 
 def turned_to_grid(scale: MetricScale, crs: str, report: Report) -> MetricScale:
@@ -31,12 +34,14 @@ def turned_to_grid(scale: MetricScale, crs: str, report: Report) -> MetricScale:
     Args:
         scale: with a place.
         crs: checked by `projected_system`.
-        report: receives a warning for a place outside the area that the system is made for.
+        report: receives a warning for a place outside the area that the system is made for, and
+            for one where the grid's metres are not those of the ground.
 
     Raises SplatError "crs-elsewhere".
     """
     assert scale.place is not None
     place = in_crs(scale.place, crs, report)
+    _warn_stretched(scale.place, crs, report)
     (ax, az), (bx, bz) = place.axes[:2, [0, 2]]
     factor = (ax + bz) / 2 + 1j * (bx - az) / 2
     return MetricScale(scale.metres, scale.source, scale.turn, place).followed_by(
@@ -83,12 +88,39 @@ def in_crs(place: EarthPlace, crs: str, report: Report) -> EarthPlace:
     return EarthPlace(crs, found[0], grid @ place.axes)
 
 
-def _warn_outside(place: EarthPlace, target: Any, crs: str, report: Report) -> None:
+def _warn_stretched(place: EarthPlace, crs: str, report: Report) -> None:
     import pyproj
 
+    latitude, longitude = _geographic(place)
+    factors = pyproj.Proj(projected_system(crs)).get_factors(longitude, latitude)
+    stretch = float(np.sqrt(factors.areal_scale))
+    if abs(stretch - 1) <= _LARGEST_STRETCH or not np.isfinite(stretch):
+        return
+    advice = "Choose a system with a smaller region."
+    if _UTM_LATITUDES[0] <= latitude < _UTM_LATITUDES[1]:
+        zone = int((longitude + 180) // 6) % 60 + 1
+        advice = f"Choose the UTM zone: EPSG:{(32600 if latitude >= 0 else 32700) + zone}."
+    report.warn(
+        "sfm-crs-stretched",
+        f"{crs} stretches lengths by {stretch:.4g} here: a metre of the files is "
+        f"{1 / stretch:.4g} m on the ground. {advice}",
+    )
+
+
+def _geographic(place: EarthPlace) -> tuple[float, float]:
+    """Latitude and longitude in degrees."""
+    import pyproj
+
+    if place.crs == GEOGRAPHIC:
+        return float(place.offset[0]), float(place.offset[1])
     back = pyproj.Transformer.from_crs(place.crs, GEOGRAPHIC, always_xy=True)
-    x, y, z = place.offset[[1, 0, 2]] if place.crs == GEOGRAPHIC else place.offset
+    x, y, z = place.offset
     longitude, latitude, _ = back.transform(x, y, z)
+    return latitude, longitude
+
+
+def _warn_outside(place: EarthPlace, target: Any, crs: str, report: Report) -> None:
+    latitude, longitude = _geographic(place)
     area = target.area_of_use
     if area is None or (
         area.south <= latitude <= area.north

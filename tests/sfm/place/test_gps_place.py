@@ -19,7 +19,7 @@ from stages.scene.place import (
     geocentric,
     geodetic,
 )
-from stages.sfm.place.crs import in_crs, projected_system
+from stages.sfm.place.crs import in_crs, projected_system, turned_to_grid
 from stages.sfm.place.gps import MetricScale, about_vertical
 from stages.sfm.place.metric_scale import UNKNOWN_SCALE, KnownScale, find_metric_scale
 
@@ -224,6 +224,59 @@ def test_grids_of_all_longitudes_have_no_outside_there(crs: str, at: tuple[int, 
     report = Report()
     in_crs(EarthPlace(GEOGRAPHIC, np.array(at, np.float64), np.eye(3)), crs, report)
     assert report.warnings == []
+
+
+def in_grid(crs: str, place: EarthPlace) -> list[tuple[str, str]]:
+    """The warnings."""
+    report = Report()
+    turned_to_grid(MetricScale(1.0, "gps", np.eye(3), place), crs, report)
+    return report.warnings
+
+
+@pytest.mark.parametrize(
+    ("crs", "at", "stretch", "advice"),
+    [
+        ("EPSG:3857", (48, 11, 500), "1.494", "EPSG:32632."),
+        ("EPSG:3857", (-34, 151, 0), "1.206", "EPSG:32756."),
+        ("EPSG:3031", (-75, 30, 0), "0.9896", "EPSG:32736."),
+        ("EPSG:3031", (-89, 30, 0), "0.9728", "Choose a system with a smaller region."),
+    ],
+)
+def test_a_grid_whose_metres_are_not_those_of_the_ground_is_a_warning(
+    crs: str, at: tuple[int, ...], stretch: str, advice: str
+) -> None:
+    pyproj = pytest.importorskip("pyproj")
+    offset = np.array(at, np.float64)
+    ((code, message),) = in_grid(crs, EarthPlace(GEOGRAPHIC, offset, EAST_DOWN_NORTH))
+    assert code == "sfm-crs-stretched"
+    assert f"{crs} stretches lengths by {stretch} here" in message
+    assert message.endswith(advice)
+    x, y = pyproj.Transformer.from_crs(GEOGRAPHIC, crs).transform(*at)[:2]
+    same = EarthPlace(crs, np.array([x, y, at[2]]), EAST_DOWN_NORTH)  # of a file in that grid
+    assert in_grid(crs, same) == [(code, message)]
+
+
+@pytest.mark.parametrize(
+    ("crs", "at"),
+    [
+        ("EPSG:25832", (47.4, 8.5, 408)),
+        ("EPSG:2193", (-41.3, 174.8, 0)),
+        ("EPSG:5514", (50.08, 14.43, 250)),
+        ("EPSG:2056", (46.9, 7.4, 500)),
+        ("EPSG:2154", (51.0, 2.0, 0)),
+    ],
+)
+def test_a_grid_of_the_region_is_no_warning(crs: str, at: tuple[int, ...]) -> None:
+    pytest.importorskip("pyproj")
+    assert in_grid(crs, EarthPlace(GEOGRAPHIC, np.array(at, np.float64), EAST_DOWN_NORTH)) == []
+
+
+def test_a_file_in_a_stretched_grid_is_no_warning_for_another_grid() -> None:
+    pyproj = pytest.importorskip("pyproj")
+    x, y = pyproj.Transformer.from_crs(GEOGRAPHIC, "EPSG:3857").transform(47.4, 8.5, 0)[:2]
+    assert (
+        in_grid("EPSG:25832", EarthPlace("EPSG:3857", np.array([x, y, 0]), EAST_DOWN_NORTH)) == []
+    )
 
 
 def test_a_grid_of_another_region_is_a_warning_or_an_error() -> None:
