@@ -36,7 +36,7 @@ class SeedSettings:
 
 STAGE = Stage(
     "seed",
-    version=13,
+    version=14,
     reads=("sfm",),
     settings_type=SeedSettings,
     **in_module("stages.seed.stage"),
