@@ -37,7 +37,7 @@ MatchedPair = tuple[int, int, NDArray[np.float64], NDArray[np.float64]]
 INLIER_DISTANCE = 0.0025  # of the longer side: 4 px of 1600
 ROUGH = 4.0  # x the distance of inliers, for rough poses
 MISFIT_RATIO, FIT_RATIO = 0.1, 0.5  # of a frame's median pair; by chance 1 % of the matches fit
-MISFIT_PAIRS = 3  # that a frame must have to be judged
+MISFIT_PAIRS = 3  # that a frame must have to be examined
 _ROUNDING = 1e-9
 
 
