@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import subprocess
@@ -10,14 +9,13 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from threading import Event
 
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stages.base.errors import Family, Interrupted, SplatError
+from stages.base.errors import Family, SplatError
 from stages.base.stage import Report
 from stages.scene import Capture, Reconstruction
 from stages.sfm import stage as sfm
@@ -26,17 +24,10 @@ from stages.sfm.settings import SfmSettings
 from tests import processes
 from tests.sfm import room_captures
 from tests.sfm.checks import bad_captures
+from tests.sfm.interruptions import damage_database, digests, interrupted
 from tests.sfm.truth import TRUTH, centres, similarity
 
 FEW = SfmSettings(max_features=2000)  # enough for the sample, and quick
-
-
-def digests(folder: Path) -> dict[str, str]:
-    return {
-        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
 
 
 def failure(capture: Capture, folder: Path, **settings: object) -> SplatError:
@@ -334,28 +325,10 @@ def test_a_time_limit_is_an_error(tmp_path: Path) -> None:
     assert error.code == "sfm-timed-out"
 
 
-def interrupted(capture: Capture, folder: Path, settings: SfmSettings = FEW) -> None:
-    """Stop the stage when it begins to match."""
-    report = Report()
-    report.stop_requested = Event()
-    report.listener = lambda label, done, total, numbers: (
-        report.stop_requested.set() if label == "matching" else None
-    )
-    with pytest.raises(Interrupted):
-        sfm.run({"ingest": capture}, settings, folder, report)
-
-
 def test_stopping_leaves_work_to_go_on_with(tmp_path: Path) -> None:
-    interrupted(bad_captures.sample(5), tmp_path)
+    interrupted(bad_captures.sample(5), tmp_path, FEW)
     assert (tmp_path / "work" / "base.features-done").exists()
     assert not (tmp_path / "sfm.json").exists()
-
-
-def damage_database(path: Path, how: str) -> None:
-    """What a power cut leaves, since COLMAP does not wait for the disk."""
-    content = path.read_bytes()
-    assert len(content) > 65536
-    path.write_bytes(b"" if how == "empty" else bytes(8192) + content[8192:])
 
 
 @pytest.mark.slow
@@ -363,7 +336,7 @@ def damage_database(path: Path, how: str) -> None:
 def test_a_damaged_database_is_made_again(
     small: tuple[Reconstruction, Report, Path], tmp_path: Path, how: str
 ) -> None:
-    interrupted(bad_captures.sample(9), tmp_path)
+    interrupted(bad_captures.sample(9), tmp_path, FEW)
     (tmp_path / "work" / "base.auto-done").touch()  # as after matching
     damage_database(tmp_path / "work" / "base.db", how)
     sfm.run({"ingest": bad_captures.sample(9)}, FEW, tmp_path, Report())

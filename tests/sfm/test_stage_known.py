@@ -18,7 +18,7 @@ from stages.scene.rotations import quaternions_of
 from stages.sfm import stage as sfm
 from stages.sfm.settings import SfmSettings
 from tests.sfm.checks import bad_captures
-from tests.sfm.test_stage import damage_database, digests, interrupted
+from tests.sfm.interruptions import damage_database, digests, interrupted
 from tests.sfm.truth import TRUTH, centres, off_by, similarity
 
 POSES = {
