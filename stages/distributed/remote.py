@@ -27,9 +27,11 @@ from stages.run.lock import locked
 from stages.run.manifest import MANIFEST, Manifest
 from stages.run.request import REQUEST
 from stages.run.runfile import RUN_FILE
-from stages.train.checkpoint import FILE_NAME
+from stages.run.workspace import USAGE
+from stages.train import cap, checkpoint
 
 Location: TypeAlias = Path | str  # a path, or a URL
+_BESIDE_CHECKPOINT = (cap.FILE_NAME, USAGE)  # what a resumed run reads besides
 _FAMILIES = {
     "url-unknown": Family.USAGE,
     "url-not-installed": Family.USAGE,
@@ -253,7 +255,9 @@ def _fetched(photos: Location | None, target: Path) -> Path | None:
 
 class UploadListener(Listener):
     """Uploads finished stages and the newest checkpoint of training, whose own checksum tells
-    whether it arrived whole; without it, a resumed run begins training again."""
+    whether it arrived whole; without it, a resumed run begins training again. The cap and the
+    usage are uploaded before it: a checkpoint without its cap would go on under the cap of another
+    worker, and give other bytes."""
 
     def __init__(self, run_folder: Path, remote: RemoteFolder) -> None:
         self._local, self._remote = run_folder, remote
@@ -267,12 +271,14 @@ class UploadListener(Listener):
             self._remote.put(self._local, [f"{self._partial}/{REQUEST}"])
 
     def progressed(self, stage: Stage, label: str, done: int, total: int, numbers: Numbers) -> None:
-        name = f"{self._partial}/{FILE_NAME}"
+        folder = self._local / self._partial
         with suppress(OSError, SplatError):  # without a checkpoint, a resumed run repeats more
-            saved_ns = (self._local / name).stat().st_mtime_ns
+            saved_ns = (folder / checkpoint.FILE_NAME).stat().st_mtime_ns
             if saved_ns != self._saved_ns:
                 self._saved_ns = saved_ns
-                self._remote.put(self._local, [name])
+                beside = [name for name in _BESIDE_CHECKPOINT if (folder / name).exists()]
+                names = [*beside, checkpoint.FILE_NAME]
+                self._remote.put(self._local, [f"{self._partial}/{name}" for name in names])
 
     def finished(self, stage: Stage, number: int, manifest: Manifest) -> None:
         label = f"{number}-{stage.name}"

@@ -17,12 +17,17 @@ from typing import Any
 import pytest
 
 from stages.base.errors import SplatError
+from stages.base.stage import Report
 from stages.distributed import remote
 from stages.run.request import REQUEST
 from stages.run.runfile import RUN_FILE
 from stages.run.stages import STAGE_OF
+from stages.train import cap, hooks
+from stages.train import stage as train
+from stages.train.settings import TrainSettings
 from tests import processes, sample
 from tests.cli.pretence import failing_at
+from tests.small_scene import small_scene
 
 fsspec = pytest.importorskip("fsspec", reason='pip install "splatcli[cluster]" brings it')
 
@@ -118,7 +123,8 @@ def test_each_checkpoint_is_uploaded_once_and_its_request_only_once(store, tmp_p
 
     store.put_file = putting
     try:
-        (partial / REQUEST).write_text(REQUEST)
+        for name in (REQUEST, "cap.json", "usage.json"):
+            (partial / name).write_text(name)
         back.started(STAGE_OF["train"], 4, "", False)
         for steps in (1, 2, 3):
             (partial / "checkpoint.bin").write_text(f"after {steps}")
@@ -130,11 +136,55 @@ def test_each_checkpoint_is_uploaded_once_and_its_request_only_once(store, tmp_p
     assert [PurePosixPath(path).name for path in put] == [
         RUN_FILE,
         REQUEST,
-        "checkpoint.bin",
-        "checkpoint.bin",
-        "checkpoint.bin",
+        *3 * ("cap.json", "usage.json", "checkpoint.bin"),
     ]
-    assert store.cat("/runs/hill/.4-train.partial/checkpoint.bin") == b"after 3"
+    there = "/runs/hill/.4-train.partial"
+    assert store.cat(f"{there}/checkpoint.bin") == b"after 3"
+    assert store.cat(f"{there}/usage.json") == b"usage.json"
+
+
+class LostError(Exception):
+    """A worker is lost."""
+
+
+@pytest.mark.timeout(300)  # the first to train compiles kernels
+def test_a_run_at_a_url_goes_on_under_its_first_cap_on_a_worker_with_less_memory(
+    tmp_path, monkeypatch
+) -> None:
+    scene = small_scene(tmp_path)
+    inputs = {"sfm": scene.reconstruction, "seed": scene.splats.with_sh_degree(0)}
+    settings = TrainSettings(steps=30, train_side=48, sh_degree=0, max_splats=0)
+    monkeypatch.setattr(cap, "splat_cap", int)
+    monkeypatch.setattr(hooks, "CHECKPOINT_SECONDS", 0.0)
+    stage = STAGE_OF["train"]
+
+    def trained(name: str, free_mib: float, last: int = 30) -> tuple[bytes, dict[str, Any]]:
+        monkeypatch.setattr(cap, "available_mib", lambda: free_mib)
+        report = Report()
+        with remote.local_copies((tmp_path / name).as_uri(), None) as (run_folder, _, upload):
+            folder = run_folder / ".4-train.partial"
+            resumed = folder.exists()
+            folder.mkdir(parents=True, exist_ok=True)
+            for file in (run_folder / RUN_FILE, folder / REQUEST):
+                file.write_text("{}")
+            upload.started(stage, 4, "", resumed)
+
+            def progressed(label: str, done: int, total: int, numbers: Any) -> None:
+                upload.progressed(stage, label, done, total, numbers)
+                if label == "training" and done == last < total:
+                    raise LostError
+
+            report.listener = progressed
+            train.run(inputs, settings, folder, report)
+            return (folder / "splats.bin").read_bytes(), report.metrics
+
+    whole, figures = trained("whole", 200.0)
+    assert (figures["splat_cap"], figures["splat_cap_from"]) == (200, "free memory")
+    with pytest.raises(LostError):
+        trained("lost", 200.0, last=12)
+    again, resumed = trained("lost", 100.0)
+    assert (resumed["resumed_from_step"], resumed["splat_cap"]) == (12, 200)
+    assert again == whole
 
 
 def test_what_fails_at_a_url_is_said_of_the_url(splat, store, pretend) -> None:
