@@ -8,6 +8,7 @@ here: `quantise` has fine-tuned the splats to the rounding of the formats.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from functools import cache
@@ -18,7 +19,7 @@ from stages import formats
 from stages.base.bad_files import reading, stage_output
 from stages.base.errors import Interrupted, QualityError, SplatError
 from stages.base.stage import Report
-from stages.base.text import counted
+from stages.base.text import counted, size
 from stages.export.reuse import digest_of, take_file
 from stages.export.settings import ExportSettings
 from stages.formats import format_of
@@ -31,7 +32,14 @@ from stages.mesh.collision_mesh import make_collision_mesh
 from stages.proof.losses import losses_of
 from stages.proof.prover import Prover, cameras_for, provers_of
 from stages.raster.backends import report_backend
-from stages.scene import ExportedAssets, ExportedFile, QuantisedSplats, Reconstruction, Splats
+from stages.scene import (
+    ExportedAssets,
+    ExportedFile,
+    QuantisedSplats,
+    Reconstruction,
+    SizeLimit,
+    Splats,
+)
 
 _INDEX = "assets.json"
 
@@ -72,6 +80,7 @@ def run(
         figures[name] = found
         files.append(ExportedFile(name, path.name, found["size_bytes"]))
         report.progress(number + 1, len(chosen), f".{name}", verify_db=found["verify_db"])
+    _warn_of_size(files, quantised.limit, report)
     meshes = _write_meshes(splats, reconstruction, settings, folder, report)
     figures |= meshes
     files += [
@@ -97,10 +106,10 @@ def _write(
     """Write a file and prove it; returns its figures. held: what it should hold. Raises SplatError
     "export-verify-failed"."""
     formats.write(path, held, units=reconstruction.units, views=reconstruction.views)
-    size = format_of(path).size_bytes(path)
+    taken = format_of(path).size_bytes(path)
     return {
-        "size_bytes": size,
-        "bytes_per_splat": round(size / max(1, len(held)), 2),
+        "size_bytes": taken,
+        "bytes_per_splat": round(taken / max(1, len(held)), 2),
         # pictures are compared with all SH coefficients, values with what the file should hold
         **_prove(prover_of(held), path, report),
     }
@@ -147,6 +156,24 @@ def _warn_of_missing(count: int, dropped: int, report: Report) -> None:
     if not count:
         report.warn(
             "export-empty", "There is not one splat to export; look at the earlier stages' figures."
+        )
+
+
+def _warn_of_size(files: list[ExportedFile], limit: SizeLimit | None, report: Report) -> None:
+    """Warn of a file that takes more than the splats were pruned for: pruning measures it before
+    quantising has chosen its values."""
+    for file in files:
+        if limit is None or file.format != limit.format or file.size_bytes <= limit.max_bytes:
+            continue
+        smaller_mb = 0.99 * limit.max_bytes**2 / file.size_bytes / 1e6  # 1 % below the limit
+        digits = 2 - math.floor(math.log10(smaller_mb))
+        smaller_mb = math.floor(smaller_mb * 10**digits) / 10**digits
+        fewer = " or a larger `splat quantise --sog-loss-db`," * FORMATS[file.format].has_bit_depths
+        report.warn(
+            "export-max-mb",
+            f"{file.path} takes {size(file.size_bytes)}, more than --max-mb "
+            f"{limit.max_bytes / 1e6:g} of `splat prune` allows. `splat prune --max-mb "
+            f"{smaller_mb:g}`,{fewer} and then `splat export` make it smaller.",
         )
 
 

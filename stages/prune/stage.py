@@ -6,6 +6,7 @@ the held-out views before and after is in the report, and decides nothing.
 
 from __future__ import annotations
 
+import json
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -15,6 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from stages.base.atomic import replacing
+from stages.base.bad_files import reading, stage_output
 from stages.base.errors import ReconstructionError, SplatError
 from stages.base.stage import Report
 from stages.evaluate.evaluation import (
@@ -33,7 +36,9 @@ from stages.prune.summary import advise_more_splats, describe_loss, summarise
 from stages.prune.targets import Targets, check_size
 from stages.raster.backends import report_backend
 from stages.scene import (
+    PrunedSplats,
     Reconstruction,
+    SizeLimit,
     Splats,
     TrainedSplats,
     evenly_spaced,
@@ -44,8 +49,12 @@ from stages.scene.storage import load_splats, save_splats
 from stages.sfm.checks.gates import STAND_STILL
 from stages.train.finetune import FineTuner
 
+_LIMIT = "limit.json"  # only where a size was requested
 
-def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report: Report) -> Splats:
+
+def run(
+    inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report: Report
+) -> PrunedSplats:
     """Prune inputs["train"] by the training views of inputs["sfm"]; write the rest to `folder`.
 
     The report gets each round, counts, and the PSNR before and after. Raises SplatError for targets
@@ -92,8 +101,7 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     if enough and (advice := advise_more_splats(found, settings.strength)):
         report.warn("prune-more-would-pay", advice)
     assert np.isfinite(found.splats.means).all()
-    save_splats(folder, found.splats)
-    return found.splats
+    return _saved(folder, found.splats, settings)
 
 
 def _contradicted() -> SplatError:
@@ -192,6 +200,22 @@ def _report_result(before: Splats, found: PruningResult, report: Report) -> None
         )
 
 
-def load(folder: Path) -> Splats:
-    """The pruned splats."""
-    return load_splats(folder)
+def _saved(folder: Path, splats: Splats, settings: PruneSettings) -> PrunedSplats:
+    """What `load` reads."""
+    save_splats(folder, splats)
+    if not settings.max_mb:
+        return PrunedSplats(splats)
+    limit = SizeLimit(settings.mb_of, settings.max_mb * 1e6)
+    with replacing(folder / _LIMIT) as temporary:
+        temporary.write_text(json.dumps(asdict(limit)) + "\n", encoding="utf-8")
+    return PrunedSplats(splats, limit)
+
+
+def load(folder: Path) -> PrunedSplats:
+    """The result of a finished folder. Raises SplatError if it is damaged."""
+    splats, path = load_splats(folder), folder / _LIMIT
+    if not path.exists():
+        return PrunedSplats(splats)
+    with reading(path, stage_output("prune-folder-damaged")):
+        limit = json.loads(path.read_text(encoding="utf-8"))
+        return PrunedSplats(splats, SizeLimit(str(limit["format"]), float(limit["max_bytes"])))

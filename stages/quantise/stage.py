@@ -14,7 +14,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -44,8 +44,10 @@ from stages.quantise.settings import QuantiseSettings
 from stages.raster.backends import report_backend
 from stages.scene import (
     DrawSettings,
+    PrunedSplats,
     QuantisedSplats,
     Reconstruction,
+    SizeLimit,
     Splats,
     TrainedSplats,
     evenly_spaced,
@@ -75,7 +77,8 @@ def run(
     was fine-tuned to, rounded_db and finetuned_db (see `quantise.format_finetuning`). Raises
     SplatError if a photograph cannot be read, and Interrupted.
     """
-    splats: Splats = inputs["prune"]
+    pruned: PrunedSplats = inputs["prune"]
+    splats = pruned.splats
     trained: TrainedSplats = inputs["train"]
     reconstruction = inputs["sfm"].with_cameras(trained.cameras).with_masks(trained.masks)
     decider, evaluator = _measures(reconstruction, splats.draw_settings, settings, report)
@@ -90,7 +93,9 @@ def run(
     flat = earlier.quantised.flat_dc if earlier else None
     if not earlier:
         flat = _flat_colours(kept if plain is None else plain, reconstruction, settings)
-    quantised = QuantisedSplats(kept, None, flat, plain=plain, drawing=settings.drawing)
+    quantised = QuantisedSplats(
+        kept, None, flat, plain=plain, drawing=settings.drawing, limit=pruned.limit
+    )
     bits, sog_db = _sog_bits(quantised, settings, decider, earlier)
     figures = earlier.figures if earlier else _figures(splats, quantised, evaluator)
     figures = {**figures, "bits": bits, "measured_on": evaluator.what}
@@ -159,6 +164,7 @@ class _Earlier:
         sh = quantised.splats, by_degree, found.pop("colour_loss_of_255")
         for name in ("sh_loss_db", "drawing", "views", "bits", "measured_on"):
             del found[name]
+        found.pop("limit", None)
         return cls(quantised, sh, sog, found, earlier.metrics.get("formats", {}))
 
 
@@ -295,6 +301,8 @@ class _Measure:
 
 def _save(folder: Path, quantised: QuantisedSplats, decisions: Mapping[str, object]) -> None:
     """decisions: what people read of them, and "bits" and "drawing", which `load` reads."""
+    if quantised.limit is not None:
+        decisions = {**decisions, "limit": asdict(quantised.limit)}
     shutil.rmtree(folder / _FINETUNED, ignore_errors=True)  # of an interrupted run
     save_splats(folder, quantised.splats)
     text = json.dumps(decisions, indent=1) + "\n"
@@ -319,6 +327,7 @@ def load(folder: Path) -> QuantisedSplats:
     with reading(folder / _DECISIONS, stage_output("quantise-folder-damaged")):
         decisions = json.loads((folder / _DECISIONS).read_text(encoding="utf-8"))
         flat = np.load(folder / _FLAT) if (folder / _FLAT).exists() else None
+        limit = decisions.get("limit")
         return QuantisedSplats(
             splats,
             decisions["bits"],
@@ -326,4 +335,5 @@ def load(folder: Path) -> QuantisedSplats:
             plain=finetuned.pop(PLAIN, None),
             finetuned=finetuned,
             drawing=decisions["drawing"],
+            limit=None if limit is None else SizeLimit(**limit),
         )

@@ -72,7 +72,7 @@ def newest_splats(pipeline: Pipeline, antialias: bool = True) -> Splats:
     output = pipeline.load(name)
     if name == "quantise" and not antialias and output.plain is not None:
         output = replace(output, splats=output.plain)
-    splats: Splats = output.splats if name in ("train", "quantise") else output
+    splats: Splats = output if name == "seed" else output.splats
     if pipeline.manifest("sfm") is None:
         return splats
     return replace(splats, place=pipeline.load("sfm").place)

@@ -140,6 +140,22 @@ class TrainedSplats:
 
 
 @dataclass(frozen=True)
+class SizeLimit:
+    """The largest size requested of a file. format: its name. max_bytes: what it may take."""
+
+    format: str
+    max_bytes: float
+
+
+@dataclass(frozen=True)
+class PrunedSplats:
+    """The result of pruning. limit: that it was pruned for; None for no limit of a file's size."""
+
+    splats: Splats
+    limit: SizeLimit | None = None
+
+
+@dataclass(frozen=True)
 class QuantisedSplats:
     """Splats as decided for export: what was kept, and at which precision.
 
@@ -153,6 +169,7 @@ class QuantisedSplats:
         plain: the splats for formats that are drawn without opacity compensation; None where
             `splats` are drawn without it, or no such format was requested.
         drawing: which formats these are, see `formats.format_table.Format.holds_antialiased`.
+        limit: that the splats were pruned for; None for no limit of a file's size.
     """
 
     splats: Splats
@@ -161,6 +178,7 @@ class QuantisedSplats:
     finetuned: Mapping[str, Splats] = field(default_factory=dict)
     plain: Splats | None = None
     drawing: str = "auto"
+    limit: SizeLimit | None = None
 
 
 def parameters_per_splat(sh_degrees: NDArray[np.integer]) -> NDArray[np.int64]:

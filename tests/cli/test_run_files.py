@@ -18,7 +18,15 @@ from stages import formats
 from stages.proof.prover import cameras_for
 from stages.run import pipeline, results
 from stages.run.pipeline import Pipeline
-from stages.scene import DrawSettings, QuantisedSplats, RefinedCameras, Splats, TrainedSplats, View
+from stages.scene import (
+    DrawSettings,
+    PrunedSplats,
+    QuantisedSplats,
+    RefinedCameras,
+    Splats,
+    TrainedSplats,
+    View,
+)
 from tests.small_scene import small_scene
 
 Outputs = dict[str, Any]
@@ -38,7 +46,7 @@ def outputs(splat, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Outputs:
     held = {
         "sfm": replace(scene.reconstruction, views=views),
         "train": TrainedSplats(splats),
-        "prune": splats,
+        "prune": PrunedSplats(splats),
         "quantise": QuantisedSplats(splats, {}),
     }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from stages import formats
 from stages.base.errors import Family, SplatError
 from stages.base.settings import check_settings
 from stages.base.stage import Earlier, Report
+from stages.base.text import size
 from stages.export import stage as export
 from stages.export.settings import ExportSettings
 from stages.formats import FORMATS
@@ -21,9 +23,15 @@ from stages.formats.mesh_table import MESHES
 from stages.mesh import fuse
 from stages.proof import checks
 from stages.proof.content import FileContent
-from stages.scene import ExportedAssets, QuantisedSplats, Splats
+from stages.prune import stage as prune
+from stages.prune.settings import PruneSettings
+from stages.quantise import stage as quantise
+from stages.quantise.settings import QuantiseSettings
+from stages.scene import ExportedAssets, QuantisedSplats, Splats, TrainedSplats
 from stages.scene.mesh import Mesh
 from tests.small_scene import SmallScene, small_scene
+
+TOO_LARGE = "export-max-mb"
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +54,39 @@ def exported(
         "quantise": QuantisedSplats(splats),
     }
     return export.run(inputs, ExportSettings(**settings), folder, report), report
+
+
+def test_a_file_above_the_size_asked_of_pruning_is_told_and_the_advice_helps(
+    scene: SmallScene, tmp_path: Path
+) -> None:
+    """A smaller --sog-loss-db keeps more bits than pruning reckoned with."""
+    asked = 0.006
+
+    def file_and_warnings(max_mb: float, name: str) -> tuple[int, dict[str, str]]:
+        inputs: dict[str, Any] = {
+            "sfm": scene.reconstruction,
+            "train": TrainedSplats(scene.splats),
+        }
+        stages: tuple[tuple[Any, Any], ...] = (
+            (prune, PruneSettings(rounds=0, finetune_steps=0, max_mb=max_mb, mb_of="sog")),
+            (quantise, QuantiseSettings(sog_loss_db=0.0, formats=("sog",), rounding_steps=1)),
+            (export, ExportSettings(formats=("sog", "ply"))),
+        )
+        for stage, settings in stages:
+            folder, report = tmp_path / name / stage.__name__, Report()
+            folder.mkdir(parents=True)
+            stage.run(inputs, settings, folder, report)
+            inputs[stage.__name__.split(".")[-2]] = stage.load(folder)
+        size_bytes = report.metrics["formats"]["sog"]["size_bytes"]
+        return size_bytes, dict(report.warnings)
+
+    size_bytes, warnings = file_and_warnings(asked, "asked")
+    assert size_bytes > asked * 1e6
+    assert f"scene.sog takes {size(size_bytes)}, more than --max-mb 0.006 " in warnings[TOO_LARGE]
+    advised = re.search(r"`splat prune --max-mb ([\d.]+)`", warnings[TOO_LARGE])
+    assert advised is not None
+    size_bytes, warnings = file_and_warnings(float(advised[1]), "advised")
+    assert size_bytes <= asked * 1e6
 
 
 def test_every_format_draws_the_same_picture_again(scene: SmallScene, tmp_path: Path) -> None:

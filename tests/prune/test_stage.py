@@ -44,7 +44,7 @@ def run(scene: SmallScene, trained: Splats, folder: Path, **settings) -> tuple[S
     report = Report()
     inputs = {"sfm": scene.reconstruction, "train": TrainedSplats(trained)}
     wanted = PruneSettings(**{"finetune_steps": 0, **settings})
-    return prune.run(inputs, wanted, folder, report), report
+    return prune.run(inputs, wanted, folder, report).splats, report
 
 
 def rows_of(part: Splats, whole: Splats) -> np.ndarray:
@@ -374,7 +374,7 @@ def test_the_same_input_gives_the_same_bytes_and_load_gives_them_back(scene, tmp
         result, _ = run(scene, trained, tmp_path / name)
     a, b = (sorted((tmp_path / name).iterdir()) for name in ("a", "b"))
     assert [p.read_bytes() for p in a] == [p.read_bytes() for p in b]
-    assert (prune.load(tmp_path / "a").means == result.means).all()
+    assert (prune.load(tmp_path / "a").splats.means == result.means).all()
 
 
 def test_the_origin_stays(scene, tmp_path) -> None:

@@ -20,7 +20,7 @@ from stages.formats.sog_quantisation import splats_to_write
 from stages.quantise import stage as quantise
 from stages.quantise.format_finetuning import FormatFinetuning
 from stages.quantise.settings import QuantiseSettings
-from stages.scene import QuantisedSplats, TrainedSplats, dc_to_rgb, split_held_out
+from stages.scene import PrunedSplats, QuantisedSplats, TrainedSplats, dc_to_rgb, split_held_out
 from tests.formats.truth import colour, many_splats
 from tests.small_scene import SmallScene, small_scene
 
@@ -37,7 +37,7 @@ def decide(
     inputs = {
         "sfm": scene.reconstruction,
         "train": TrainedSplats(scene.splats),
-        "prune": scene.splats,
+        "prune": PrunedSplats(scene.splats),
     }
     chosen = QuantiseSettings(**{"rounding_steps": 0, **settings})
     result = quantise.run(inputs, chosen, folder, report)
@@ -162,7 +162,11 @@ def test_a_large_loss_by_plain_drawing_is_a_warning(
     scene: SmallScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     splats = scene.splats.with_antialias(True)
-    inputs = {"sfm": scene.reconstruction, "train": TrainedSplats(splats), "prune": splats}
+    inputs = {
+        "sfm": scene.reconstruction,
+        "train": TrainedSplats(splats),
+        "prune": PrunedSplats(splats),
+    }
     settings = QuantiseSettings(formats=("ply",), plain_steps=1, rounding_steps=0)
     for large_db, warned in ((0.1, ["quantise-plain-drawing"]), (1.0, [])):
         monkeypatch.setattr(quantise, "_PLAIN_LOSS_DB", large_db)
@@ -302,7 +306,7 @@ def test_a_further_format_measures_only_what_it_needs_and_gives_the_same_bytes(
     inputs = {
         "sfm": scene.reconstruction,
         "train": TrainedSplats(scene.splats.with_antialias(True)),
-        "prune": scene.splats.with_antialias(True),
+        "prune": PrunedSplats(scene.splats.with_antialias(True)),
     }
 
     def run(folder: str, formats: tuple[str, ...], earlier: Earlier | None = None) -> Report:
@@ -332,7 +336,7 @@ def test_a_further_format_that_is_drawn_in_another_way_takes_the_sh_degrees_alon
     inputs = {
         "sfm": scene.reconstruction,
         "train": TrainedSplats(scene.splats.with_antialias(True)),
-        "prune": scene.splats.with_antialias(True),
+        "prune": PrunedSplats(scene.splats.with_antialias(True)),
     }
     reports: dict[str, Report] = {}
     for folder, formats in (("first", ("spz",)), ("whole", ("spz", "splat")), ("added", None)):

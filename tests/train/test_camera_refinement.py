@@ -17,7 +17,7 @@ from stages.quantise import stage as quantise
 from stages.quantise.settings import QuantiseSettings
 from stages.raster.cpu.rasteriser import CpuRasteriser
 from stages.raster.definition import RasterSettings
-from stages.scene import Reconstruction, RefinedCameras, TrainedSplats, split_held_out
+from stages.scene import PrunedSplats, Reconstruction, RefinedCameras, TrainedSplats, split_held_out
 from stages.train import stage as train
 from stages.train.camera_refinement import camera_gradients
 from stages.train.conversion import model_of
@@ -191,7 +191,7 @@ def test_later_stages_measure_from_the_refined_cameras(scene, tmp_path, stage) -
     inputs = {
         "sfm": shaken(scene, 0.03, held_out=True),
         "train": TrainedSplats(scene.splats, cameras=cameras),
-        "prune": scene.splats,
+        "prune": PrunedSplats(scene.splats),
     }
     stage.run(inputs, QUICK[stage], tmp_path, report)
     right_db = mean_psnr_db(scene.splats, held_out_of(true, scene.splats), "cpu")
