@@ -162,7 +162,8 @@ def settings_of(settings_type: type) -> list[Setting]:
 
 def check_settings(settings: Any) -> None:
     """Check every field of a settings dataclass. Raises SplatError "option-value", and
-    "option-alone" for a setting whose `needs` is not given."""
+    "option-alone" for a setting whose `needs` is not given. A settings dataclass may have a method
+    `check` of its own, for what fields say together."""
     every = {setting.name: setting for setting in settings_of(type(settings))}
     for name, setting in every.items():
         setting.check(getattr(settings, name))
@@ -176,6 +177,8 @@ def check_settings(settings: Any) -> None:
                 wanted="Both, or neither.",
                 hint=f"Add {other.flag}, or leave {setting.flag} out.",
             )
+    if hasattr(settings, "check"):
+        settings.check()
 
 
 def changed(settings: Any, typed: Mapping[str, Any]) -> Any:

@@ -346,12 +346,17 @@ def _check(settings: TrainSettings) -> None:
             wanted="A maximum that the blocks can share: the free memory limits only one block.",
             hint="Give --max-splats, for example 250000 for each block.",
         )
-    unfit = settings.seconds, settings.within, settings.refine_in_training, settings.splats
-    if any(unfit):
+    unfit = {  # what takes it back: leaving it away keeps what the run has recorded
+        "--seconds": ("--seconds 0", settings.seconds),
+        "--within": ("--within 0 0 0 0", settings.within),
+        "--refine-in-training": ("--no-refine-in-training", settings.refine_in_training),
+        "--splats": ('--splats ""', settings.splats),
+    }
+    if found := {flag: unset for flag, (unset, value) in unfit.items() if value}:
+        command = "`splat process`" if settings.splats else "the command"  # seeding has them, too
         raise UsageError(
             "blocks-without-end",
-            given="--blocks cannot be combined with --seconds, --within, --refine-in-training or "
-            "--splats.",
+            given=f"--blocks cannot be combined with {' and '.join(found)}.",
             wanted="Steps, which each block makes: --steps.",
-            hint="Leave --seconds, --within, --refine-in-training and --splats away.",
+            hint=f"Add `{' '.join(found.values())}` to {command}.",
         )

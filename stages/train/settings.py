@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from stages.base.errors import UsageError
 from stages.base.settings import setting
 from stages.base.stage import Stage, in_module
 from stages.formats.format_table import PLAIN
@@ -107,8 +108,9 @@ class TrainSettings:
     within: tuple[float, ...] = setting(
         (),
         "Densify only inside this rectangle of the ground plane (world units); the "
-        "rest stays as coarse as it is.",
+        "rest stays as coarse as it is. 0 0 0 0: everywhere.",
         together="X0 Z0 X1 Z1",
+        panel="Advanced",
         min=-1e30,
         max=1e30,
     )
@@ -126,6 +128,25 @@ class TrainSettings:
         panel="Size",
         needs="splats",
     )
+
+    def __post_init__(self) -> None:
+        if self.within == (0, 0, 0, 0):  # takes back a rectangle that was recorded
+            object.__setattr__(self, "within", ())
+
+    def check(self) -> None:
+        """Raises SplatError "option-value" for a rectangle that is empty or reversed."""
+        match self.within:
+            case (x0, z0, x1, z1):
+                ordered = x0 < x1 and z0 < z1
+            case values:
+                ordered = not values
+        if not ordered:
+            raise UsageError(
+                "option-value",
+                given=f"--within {' '.join(f'{value:g}' for value in self.within)} cannot be used.",
+                wanted="X0 Z0 X1 Z1 with X0 less than X1 and Z0 less than Z1, or 0 0 0 0 for none.",
+                hint="Give the smaller corner first.",
+            )
 
     @staticmethod
     def completed(given: Mapping[str, Any]) -> dict[str, Any]:

@@ -33,6 +33,14 @@ def with_value(name: str, setting: Setting, value: Any) -> Any:
     return replace(STAGE_OF[name].settings_type(), **{setting.name: value})
 
 
+def check_value(name: str, setting: Setting, value: Any) -> None:
+    """Several values together may be limited by each other, so one is checked by itself."""
+    if setting.together:
+        setting.check(value)
+    else:
+        check_settings(with_value(name, setting, value))
+
+
 @pytest.mark.parametrize("key", EVERY)
 def test_every_setting_has_help_and_a_default_that_it_allows(key: str) -> None:
     _, setting = EVERY[key]
@@ -46,12 +54,12 @@ def test_every_number_of_every_stage_has_two_ends_and_both_may_be_used(key: str)
     assert setting.low is not None
     assert setting.high is not None
     for end in (setting.low, setting.high):
-        check_settings(with_value(name, setting, setting.kind(end)))
+        check_value(name, setting, setting.kind(end))
     step = 1 + 1e-9 * max(abs(setting.low), abs(setting.high))  # that a float can tell
     low, high = (setting.kind(end) for end in (setting.low - step, setting.high + step))
     for beyond in (low, high, float("nan"), float("inf"), "7", True):
         with pytest.raises(SplatError, match=setting.flag) as caught:
-            check_settings(with_value(name, setting, beyond))
+            check_value(name, setting, beyond)
         assert caught.value.code == "option-value"
         assert f"{setting.low:,} to {setting.high:,}" in caught.value.wanted
 
