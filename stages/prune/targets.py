@@ -97,7 +97,8 @@ def check_size(max_bytes: float, size_bytes: int, count: int) -> None:
     if size_bytes > max_bytes:
         raise UsageError(
             "prune-too-small",
-            given=f"--max-mb {max_bytes / 1e6:g} is less than {counted(count, 'splat')} take.",
+            given=f"--max-mb {max_bytes / 1e6:g} is less than {counted(count, 'splat')} "
+            f"{'takes' if count == 1 else 'take'}.",
             wanted=f"At least {np.ceil(size_bytes / 1e3) / 1000:g}.",
             hint="Ask for more megabytes, or for another format with --mb-of.",
         )

@@ -300,7 +300,7 @@ def test_a_psnr_with_no_rounds_removes_nothing(scene, tmp_path) -> None:
     ("settings", "code", "named"),
     [
         ({"min_psnr": 90}, "prune-psnr-not-reached", "At most 3"),
-        ({"max_mb": 1e-5}, "prune-too-small", "1 splat"),
+        ({"max_mb": 1e-5}, "prune-too-small", "1 splat takes."),
         ({"max_splats": 60, "min_psnr": 30}, "prune-targets-contradict", "--min-psnr 18"),
     ],
 )
