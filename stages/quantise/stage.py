@@ -251,7 +251,7 @@ def _measures(
     settings: QuantiseSettings,
     report: Report,
 ) -> tuple[_Measure, _Measure]:
-    """(what decides: training views; what evaluates: held-out views if there are any)."""
+    """(what decides: training views; what evaluates: held-out views if a pixel of any counts)."""
     training, held_out = split_held_out(reconstruction.views)
     if not training:
         raise RunFolderError(
@@ -262,12 +262,14 @@ def _measures(
         )
     deciding = tuple(evenly_spaced(training, DECIDING_VIEWS))
     subset = [held_out[i] for i in evaluation_subset(len(held_out))]
-    evaluated, what = (subset, "held out") if subset else (deciding, "training")
     folder, backend = reconstruction.folder, settings.backend
     decider, evaluator = (
         load_evaluation_views(folder, views, draw_settings, report.stop_requested)
-        for views in (deciding, evaluated)
+        for views in (deciding, subset)
     )
+    what = "held out"
+    if not any(view.counts for view in evaluator):  # none is held out, or masks leave nothing
+        evaluator, what = decider, "training"
     # As it is, three lower degrees, each threshold, and about as many bit depths.
     planned = 5 + len(_THRESHOLDS_OF_255) + _BIT_DEPTH_MEASUREMENTS * (_SOG in settings.formats)
     return _Measure(decider, backend, report, planned), _Measure(
@@ -295,8 +297,13 @@ class _Measure:
         return mean
 
     def psnr_at_sizes(self, splats: Splats, stem: str) -> dict[str, float]:
-        """Mean PSNR at each of `SIZES`, by the name of the metric."""
-        return {psnr_name(size, stem): self.psnr(splats, scale) for size, scale in SIZES.items()}
+        """Mean PSNR at each of `SIZES`, by the name of the metric. A smaller size is left out if no
+        pixel of it is compared, as beside thin masks."""
+        return {
+            psnr_name(size, stem): self.psnr(splats, scale)
+            for size, scale in SIZES.items()
+            if scale == 1 or any(view.scaled(scale).counts for view in self.views)
+        }
 
 
 def _save(folder: Path, quantised: QuantisedSplats, decisions: Mapping[str, object]) -> None:

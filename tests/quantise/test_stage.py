@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from stages.base.errors import Family, SplatError
 from stages.base.settings import check_settings
@@ -20,7 +21,14 @@ from stages.formats.sog_quantisation import splats_to_write
 from stages.quantise import stage as quantise
 from stages.quantise.format_finetuning import FormatFinetuning
 from stages.quantise.settings import QuantiseSettings
-from stages.scene import PrunedSplats, QuantisedSplats, TrainedSplats, dc_to_rgb, split_held_out
+from stages.scene import (
+    IGNORE,
+    PrunedSplats,
+    QuantisedSplats,
+    TrainedSplats,
+    dc_to_rgb,
+    split_held_out,
+)
 from tests.formats.truth import colour, many_splats
 from tests.small_scene import SmallScene, small_scene
 
@@ -58,6 +66,28 @@ def test_matt_splats_lose_their_sh_degrees_and_shiny_ones_keep_them(
     assert result.splats.sh_degrees.tolist() == [
         int(np.sqrt(np.flatnonzero(row.any(axis=1)).max(initial=0))) for row in result.splats.sh
     ]
+
+
+def test_held_out_views_without_a_pixel_that_counts_are_in_no_figure(
+    scene: SmallScene, tmp_path: Path
+) -> None:
+    """Masks leave nothing of both; or too little for a pixel at a quarter of the size."""
+    line = np.zeros((54, 72), np.uint8)
+    line[20:22] = 255
+    held_out = {view.name for view in split_held_out(scene.reconstruction.views)[1]}
+    for mask, measured_on in ((np.zeros_like(line), "training"), (line, "held out")):
+        Image.fromarray(mask).save(tmp_path / "mask.png")
+        views = tuple(
+            replace(view, mask=str(tmp_path / "mask.png"), outside=IGNORE)
+            if view.name in held_out
+            else view
+            for view in scene.reconstruction.views
+        )
+        masked = replace(scene, reconstruction=replace(scene.reconstruction, views=views))
+        _, metrics = decide(masked, tmp_path)
+        assert metrics["measured_on"] == measured_on
+        assert all(metrics[name] > 20 for name in metrics if name.startswith("psnr_kept"))
+        assert ("psnr_kept_quarter_db" in metrics) == (measured_on == "training")
 
 
 def test_the_cost_of_8_bits_without_view_dependence_is_reported(
