@@ -12,9 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stages.base.text import listed
 from stages.evaluate.evaluation import SIZES, EvaluationView
+from stages.raster.definition import Rendering
 from stages.raster.draw import renderer, supersampled
 from stages.scene import Splats
 
@@ -51,6 +53,45 @@ class Verdict:
     text: str
 
 
+@dataclass(frozen=True)
+class _Drawn:
+    """What is kept of a view that is drawn, since its photograph and its drawing would take too
+    much memory for all views.
+
+    Args:
+        name: of the photograph.
+        explained: see `Fit`.
+        error: [P] of each compared pixel, squared.
+        depth: [P] that is drawn there.
+        see_through: [P] where hardly anything is drawn.
+    """
+
+    name: str
+    explained: float
+    error: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    see_through: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, view: EvaluationView, rendering: Rendering) -> _Drawn:
+        """Of a view that counts."""
+        truth = view.image.astype(np.float64)
+        valid = np.ones(truth.shape[:2], bool) if view.valid is None else view.valid
+        error = ((np.clip(rendering.image, 0.0, 1.0) - truth) ** 2).mean(axis=2)[valid]
+        variance = max(float(truth[valid].var(axis=0).mean()), LEAST_VARIANCE)
+        see_through = (rendering.alpha < 0.5)[valid]
+        explained = 1.0 - float(error.mean()) / variance
+        small = error.astype(np.float32)
+        return cls(view.name, explained, small, rendering.depth[valid], see_through)
+
+    def fit(self, far: float) -> Fit:
+        """far: depth from which on a pixel lies behind the subject."""
+        behind = (self.depth > far) | self.see_through
+        whole = float(self.error.sum(dtype=np.float64))
+        share = float(self.error[behind].sum(dtype=np.float64)) / max(whole, 1e-12)
+        return Fit(self.name, self.explained, share)
+
+
 def fits(splats: Splats, views: Sequence[EvaluationView], backend: str) -> list[Fit]:
     """How well each of the views is drawn, at a quarter of its size. Splats for plain drawing are
     drawn at their own size and averaged: drawn small they are too large, which is no fault of the
@@ -58,26 +99,17 @@ def fits(splats: Splats, views: Sequence[EvaluationView], backend: str) -> list[
     draw = renderer(splats, backend=backend)
     if not splats.draw_settings.antialias:
         draw = supersampled(draw, splats.draw_settings.side)
-    drawn = [(view, draw(view.camera)) for view in (v.scaled(SIZES["quarter"]) for v in views)]
-    middles = []
-    for view, rendering in drawn:
+    middles, drawn = [], []
+    for view in (full.scaled(SIZES["quarter"]) for full in views):
+        rendering = draw(view.camera)
         height, width = view.pixels.shape[:2]
         middle = rendering.depth[height // 3 : -(-2 * height // 3), width // 3 : -(-2 * width // 3)]
         middles.append(middle[middle > 0])
+        if view.counts:
+            drawn.append(_Drawn.of(view, rendering))
     known = np.concatenate(middles) if middles else np.zeros(0)
     far = BEHIND * float(np.median(known)) if known.size else np.inf
-    found = []
-    for view, rendering in drawn:
-        truth = view.image.astype(np.float64)
-        valid = np.ones(truth.shape[:2], bool) if view.valid is None else view.valid
-        if not valid.any():
-            continue
-        error = ((np.clip(rendering.image, 0.0, 1.0) - truth) ** 2).mean(axis=2)[valid]
-        variance = max(float(truth[valid].var(axis=0).mean()), LEAST_VARIANCE)
-        behind = ((rendering.depth > far) | (rendering.alpha < 0.5))[valid]
-        share = float(error[behind].sum() / max(error.sum(), 1e-12))
-        found.append(Fit(view.name, 1.0 - float(error.mean()) / variance, share))
-    return found
+    return [one.fit(far) for one in drawn]
 
 
 def verdict(held_out: Sequence[Fit], training: Sequence[Fit]) -> Verdict:

@@ -87,13 +87,12 @@ def report_verdict(
     backend: str,
     report: Report,
 ) -> Verdict:
-    """The verdict on `splats`, which becomes the metric "verdict". views: held out."""
+    """The verdict on `splats`, which becomes the metric "verdict". views: all that are held out."""
     training = evenly_spaced(split_held_out(reconstruction.views)[0], LARGEST_SUBSET)
     seen = load_evaluation_views(
         reconstruction.folder, training, splats.draw_settings, report.stop_requested
     )
-    held_out = [views[i] for i in evaluation_subset(len(views))]
-    found = verdict(fits(splats, held_out, backend), fits(splats, seen, backend))
+    found = verdict(fits(splats, views, backend), fits(splats, seen, backend))
     report.metric("verdict", asdict(found))
     return found
 

@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from stages.base.stage import Report
 from stages.evaluate.evaluation import load_evaluation_views
 from stages.evaluate.verdict import GOOD, UNKNOWN, USABLE, WRONG, Fit, fits, verdict
 from stages.scene import Splats
+from stages.train.quality import report_verdict
 from tests.scenes import join, splats
 from tests.small_scene import small_scene
 
@@ -63,6 +65,22 @@ def _shell(radius: float) -> Splats:
     angle = np.linspace(0, 2 * np.pi, 60, endpoint=False)
     means = radius * np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=1)
     return splats(means, scales=3.0, opacities=0.9, rgb=(0.9, 0.9, 0.9))
+
+
+def test_every_held_out_view_counts_in_the_verdict(tmp_path: Path) -> None:
+    """25 are held out, and number 1 alone is poor."""
+    scene = small_scene(tmp_path, views=25)
+    drawn = scene.splats.with_antialias(True)
+    views = list(load_evaluation_views(tmp_path, scene.reconstruction.views, drawn.draw_settings))
+    inverted = [replace(view, pixels=255 - view.pixels) for view in views]
+    one_poor = [*views[:1], inverted[1], *views[2:]]
+    assert len(fits(drawn, one_poor, "cpu")) == 25
+    report = Report()
+    found = report_verdict(drawn, one_poor, scene.reconstruction, "cpu", report)
+    assert found.grade == GOOD
+    assert found.text.endswith(" Only 01.png is poor.")
+    found = report_verdict(drawn, inverted, scene.reconstruction, "cpu", report)
+    assert "25 of 25 held-out photographs are poor" in found.text
 
 
 def test_contrast_and_a_bare_wall_are_no_fault(tmp_path: Path) -> None:
