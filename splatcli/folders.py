@@ -6,6 +6,7 @@ from pathlib import Path
 
 from splatcli import console
 from stages.base.errors import SplatError, UsageError
+from stages.base.text import quoted
 from stages.run import results, runfolder
 from stages.run.pipeline import Pipeline
 from stages.scene import Splats
@@ -52,7 +53,7 @@ def find_run_folder(named: Path | None = None) -> Path:
             "run-folder-unclear",
             given=f"There are several run folders here: {', '.join(map(str, folders))}.",
             wanted="One of them.",
-            hint=f"Name it: splat status {folders[0]}",
+            hint=f"Name it: splat status {quoted(folders[0])}",
         )
     raise runfolder.missing(here.resolve())
 
@@ -91,7 +92,7 @@ def load_target(
         console.warn(
             f"Warning: {' and '.join(dict.fromkeys(stale.values()))} ran again since "
             f"{', '.join(stale)} did. These are the splats of "
-            f"{results.newest_stage_with_splats(pipeline)}; `splat process {pipeline.run_folder}` "
-            "renews the rest."
+            f"{results.newest_stage_with_splats(pipeline)}; "
+            f"`splat process {quoted(pipeline.run_folder)}` renews the rest."
         )
     return splats, pipeline

@@ -8,7 +8,7 @@ from typing import Any
 from rich.text import Text
 
 from splatcli import console, progress
-from stages.base.text import counted, listed
+from stages.base.text import counted, listed, quoted
 from stages.evaluate.verdict import GOOD, UNKNOWN, USABLE, WRONG
 from stages.run.manifest import Manifest
 from stages.run.pipeline import Pipeline
@@ -76,7 +76,7 @@ def show(pipeline: Pipeline, until: str | None) -> None:
     if verdict:
         console.out.print()
         console.paragraph(console.out, styled(verdict))
-        console.out.print(f"Look at it: splat view {pipeline.run_folder}", markup=False)
+        console.out.print(f"Look at it: splat view {quoted(pipeline.run_folder)}", markup=False)
 
 
 def styled(verdict: Mapping[str, str]) -> Text:

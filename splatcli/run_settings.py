@@ -13,6 +13,7 @@ import typer
 from splatcli import console, options
 from stages.base.errors import UsageError
 from stages.base.settings import UNSET, Setting, changed, settings_of
+from stages.base.text import quoted
 from stages.raster.backends import backend_of
 from stages.run.pipeline import Pipeline
 from stages.run.runfolder import is_run_folder
@@ -163,7 +164,7 @@ def _trained_splats(run: Path, run_folder: Path) -> Path:
             "option-out",
             given=f"{run} would start from its own splats, and training replaces them.",
             wanted="A folder of its own for the run that goes on from them.",
-            hint=f"splat process {run} --out NEW --splats {run} --steps 3000",
+            hint=f"splat process {quoted(run)} --out NEW --splats {quoted(run)} --steps 3000",
         )
     earlier = Pipeline(run)
     earlier.load("train")  # raises if it has not finished, or is damaged

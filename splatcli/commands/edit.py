@@ -17,7 +17,7 @@ from stages import formats
 from stages.base import scratch
 from stages.base.atomic import make_folder
 from stages.base.errors import UsageError
-from stages.base.text import counted
+from stages.base.text import counted, quoted
 from stages.editing import levels, operations
 from stages.editing.scene import EditedScene
 from stages.editing.syntax import ParsedOperation
@@ -54,9 +54,9 @@ def edit(
     if target is None and not dry_run:
         raise UsageError(
             "edit-no-target",
-            given=f"splat edit {source} names no file to write.",
+            given=f"splat edit {quoted(source)} names no file to write.",
             wanted="A second file name, or --dry-run.",
-            hint=f"splat edit {source} edited.ply --keep 'opacity > 0.1'",
+            hint=f"splat edit {quoted(source)} edited.ply --keep 'opacity > 0.1'",
         )
     if target is not None and not dry_run:
         check_target(target, no_clobber)

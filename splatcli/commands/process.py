@@ -11,6 +11,7 @@ from splatcli.arguments import Cluster, Out, Photos, Run
 from splatcli.folders import DEFAULT, find_run_folder, run_folder_for
 from stages.base.errors import UsageError
 from stages.base.settings import changed
+from stages.base.text import quoted
 from stages.run import runfolder
 from stages.run.branch import branch
 from stages.run.listener import Listener, Listeners
@@ -99,7 +100,7 @@ def _run_stage(name: str, pipeline: Pipeline, given: Mapping[str, Any]) -> None:
             "option-alone",
             given=f"--splats concerns seeding and training, and splat {name} runs one of them.",
             wanted="The command of the whole run.",
-            hint=f"splat process {pipeline.run_folder} --splats FILE",
+            hint=f"splat process {quoted(pipeline.run_folder)} --splats FILE",
         )
     preset, view = given.pop("preset", None), given.pop("view", False)
     if "formats" in given:

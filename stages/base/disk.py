@@ -44,10 +44,10 @@ def not_permitted(path: Path, error: OSError) -> SplatError:
     place = next(p for p in (path, *path.absolute().parents) if os.path.lexists(p))
     needed = os.R_OK | os.X_OK if os.path.isdir(place) else os.R_OK
     reads = error.errno != errno.EROFS and not os.access(place, needed)
+    other = "place; a run goes on there with `splat process RUN --out FOLDER`."
     return ResourceError(
         "not-permitted",
         given=f"{path}: {error.strerror or error}.",
         wanted=f"A file or folder that you may {'read' if reads else 'write to'}.",
-        hint="Change its permissions, or name another "
-        + ("one." if reads else "folder with --out."),
+        hint=f"Change its permissions, or name another {'one.' if reads else other}",
     )

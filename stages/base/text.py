@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Sequence
+from pathlib import Path
 
 from rich.filesize import decimal
 
@@ -28,6 +30,11 @@ def listed(names: Sequence[str], most: int = 8) -> str:
     """Names for a message: the first `most` of them, and how many there are besides."""
     rest = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(name[:80] for name in names[:most]) + rest
+
+
+def quoted(path: Path | str) -> str:
+    """A path, or a URL, as it stands in a command for a shell."""
+    return shlex.quote(str(path))
 
 
 def printable(text: str) -> str:

@@ -45,6 +45,7 @@ _USUAL_FRACTIONAL_BITS, _MOST_FRACTIONAL_BITS = 12, 23
 # Where 12 fractional bits do not hold the scene, fewer do: steps up to this share of the distance
 # between neighbouring splats.
 _STEP_OF_SPACING = 1 / 16
+_OUTLIERS = 0.01  # at most this share of the splats is moved for finer steps
 _FIXED_LIMIT = (1 << 23) - 1
 LOG_SIZES = (-10.0, -10.0 + 255 / 16)
 _SH_STEPS = (8, 16, 16)  # of 256, for degree 1, 2, 3: 5 and 4 bits, which gzip compresses
@@ -134,16 +135,23 @@ def _within_reach(splats: Splats, bits: int) -> Splats:
 
 def _fractional_bits(means: NDArray[np.floating]) -> int:
     """As many as the largest coordinate allows: small scenes get finer steps. Scenes beyond 2048
-    units get coarser steps, as long as neighbouring splats stay distinct."""
-    largest = float(max(means.max(initial=0.0), -means.min(initial=0.0)))
-    if largest == 0:
-        return _USUAL_FRACTIONAL_BITS
-    most = min(math.floor(math.log2(_FIXED_LIMIT / largest)), _MOST_FRACTIONAL_BITS)
+    units get coarser steps, as long as neighbouring splats stay distinct: a few outliers are moved
+    rather."""
+    farthest = np.abs(means).max(axis=1, initial=0.0)
+    most = _bits_that_hold(float(farthest.max(initial=0.0)))
     if most >= _USUAL_FRACTIONAL_BITS:
-        return most
+        return min(most, _MOST_FRACTIONAL_BITS)
     spacing = median_spacing(means)
-    least = math.ceil(-math.log2(_STEP_OF_SPACING * spacing)) if spacing else 0
-    return max(most, min(max(least, 0), _USUAL_FRACTIONAL_BITS))
+    distinct = max(math.ceil(-math.log2(_STEP_OF_SPACING * spacing)), 0) if spacing else 0
+    most_splats = _bits_that_hold(float(np.quantile(farthest, 1 - _OUTLIERS, method="lower")))
+    return max(most, min(distinct, most_splats, _USUAL_FRACTIONAL_BITS), 0)
+
+
+def _bits_that_hold(coordinate: float) -> int:
+    """The most fractional bits with which 24 bits hold `coordinate`."""
+    if coordinate == 0:
+        return _USUAL_FRACTIONAL_BITS
+    return math.floor(math.log2(_FIXED_LIMIT / coordinate))
 
 
 def _positions(splats: Splats, bits: int) -> NDArray[np.uint8]:

@@ -31,6 +31,7 @@ from stages.raster.backends import AUTO
 from stages.raster.draw import raster_settings_of, renderer
 from stages.scene import Camera, QuantisedSplats, Splats, View, evenly_spaced, split_held_out
 from stages.scene.framing import orbit_cameras
+from stages.scene.quantiles import quantiles
 
 _SIDE_PX = 480
 _CAMERAS = 3
@@ -38,6 +39,7 @@ _CENTRAL_SHARE = 0.5  # of the splats, to look at where no views are known
 _MAX_DRAWN = 1 << 22
 _MIN_LOSSLESS_DB = 45.0  # a file of a lossless format below this is wrong
 _WARN_LOSSY_DB = 30.0  # a file of a lossy format below this gets a warning
+_FAR = 1000  # times the extent of most splats
 _REPORT = "Write another format, and report this with the file that was read."
 DROP_OUTLIERS = "`splat edit --drop-floaters` removes outliers"
 _WRONG = {
@@ -133,6 +135,8 @@ class Prover:
         """How the splats would fit the format of `path` better; "" if they fit."""
         if advice := CODECS[format_of(path).ending].size_loss(self.splats)[1]:
             return advice
+        if advice := _far_from_zero(self.splats.means):
+            return advice
         return DROP_OUTLIERS if outlier_shells(self.splats.means).any() else ""
 
     def with_original(self, splats: Splats) -> Prover:
@@ -219,6 +223,16 @@ def provers_of(
     return lambda held: provers.get(
         held.draw_settings.antialias, next(iter(provers.values()))
     ).with_original(held)
+
+
+def _far_from_zero(means: NDArray[np.floating]) -> str:
+    """The advice to move splats that lie farther from zero, as on a map grid, than a format has
+    steps for; "" if they do not."""
+    low, middle, high = quantiles(means, (0.1, 0.5, 0.9))
+    if np.abs(middle).max() < _FAR * (high - low).max():
+        return ""
+    move = ",".join(f"{-round(value):d}" for value in middle)
+    return f"`splat edit --move={move}` brings them near zero, where formats have finer steps"
 
 
 def _central_rows(splats: Splats) -> NDArray[np.bool_] | slice:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
@@ -15,6 +14,7 @@ from stages.base.errors import Family, Interrupted, RunFolderError, SplatError, 
 from stages.base.interrupt import stop_event
 from stages.base.settings import check_settings
 from stages.base.stage import Stage
+from stages.base.text import quoted
 from stages.run import runfolder
 from stages.run.attempt import attempt
 from stages.run.digests import damage
@@ -117,13 +117,13 @@ class Pipeline:
                 damaged[folder] = changes
         if damaged:
             what = (f"{folder.name}/{change}" for folder in damaged for change in damaged[folder])
-            folders = " and ".join(shlex.quote(str(folder)) for folder in damaged)
+            folders = " and ".join(quoted(folder) for folder in damaged)
             raise RunFolderError(
                 "run-folder-damaged",
                 given=f"In {self.run_folder}, {', '.join(what)}.",
                 wanted="The files as the stages wrote them.",
                 hint=f"Check the disk. Delete {folders}; then `splat process "
-                f"{shlex.quote(str(self.run_folder))}` makes this again, and what depends on it if "
+                f"{quoted(self.run_folder)}` makes this again, and what depends on it if "
                 "it differs.",
             )
 
@@ -258,7 +258,7 @@ class Pipeline:
                 raise self._not_finished(step.stage.name, what)
 
     def _not_finished(self, name: str, what: str) -> SplatError:
-        folder = shlex.quote(str(self.run_folder))
+        folder = quoted(self.run_folder)
         return UsageError(
             "stage-not-finished",
             given=f"In {self.run_folder}, {what}.",

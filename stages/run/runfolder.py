@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from stages.base.errors import RunFolderError, SplatError, UsageError
+from stages.base.text import quoted
 from stages.run.digests import combined_digest, record_files
 from stages.run.lock import HOLDER, LOCK, locked
 from stages.run.manifest import MANIFEST, Manifest
@@ -112,7 +113,7 @@ def check_photos(folder: Path, photos: Path) -> None:
             "photographs-run-folder",
             given=f"{photos} {what}.",
             wanted="A folder of photographs as they were taken.",
-            hint=f"To continue the run: splat process {run}",
+            hint=f"To continue the run: splat process {quoted(run)}",
         )
     check_outside(folder, photos)
 

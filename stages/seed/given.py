@@ -20,7 +20,7 @@ from stages import formats
 from stages.base.errors import ResourceError, SplatError
 from stages.base.memory import MIB, available_mib, training_mib
 from stages.base.stage import Report
-from stages.base.text import counted, size
+from stages.base.text import counted, quoted, size
 from stages.evaluate.evaluation import EvaluationView, load_evaluation_views, mean_psnr_db
 from stages.evaluate.image_metrics import psnr
 from stages.raster.backends import AUTO
@@ -104,7 +104,7 @@ def _check_memory(path: Path, splats: int) -> None:
             f"{size(needed * MIB)}, and {size(free * MIB)} of memory are free.",
             wanted="Splats that fit into memory.",
             hint="Close other programs, or merge splats first: "
-            f"splat edit {path.name} smaller.ply --decimate {int(free / training_mib(1) / 2)}",
+            f"splat edit {quoted(path)} smaller.ply --decimate {int(free / training_mib(1) / 2)}",
         )
 
 

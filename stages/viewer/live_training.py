@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 
 from stages.base.stage import DrawView, Numbers, Stage
+from stages.base.text import quoted
 from stages.page.cameras import page_cameras
 from stages.run.listener import Listener
 from stages.run.manifest import Manifest
@@ -68,7 +69,7 @@ class LiveTraining(Listener):
         if stage.name == _STAGE:
             self._warn(
                 "--view: training had finished before, so there is nothing to watch. "
-                f"See the result with: splat view {self._pipeline.run_folder}"
+                f"See the result with: splat view {quoted(self._pipeline.run_folder)}"
             )
 
     def ended(self) -> None:

@@ -25,6 +25,7 @@ def shown(
     settings: dict[str, Any] | None = None,
     views: int = 21,
     steps: int = 3150,
+    run: str = "run",
 ) -> str:
     """The output for a run of `sfm` and `train`, this with `settings`."""
     metrics: dict[str, Any] = {
@@ -50,8 +51,8 @@ def shown(
     pipeline: Any = SimpleNamespace(
         layout=SimpleNamespace(up_to=lambda until: [SimpleNamespace(name=n) for n in manifests]),
         manifest=manifests.get,
-        stage_folder=lambda name: Path("run") / name,
-        run_folder=Path("run"),
+        stage_folder=lambda name: Path(run) / name,
+        run_folder=Path(run),
     )
     run_result.show(pipeline, "train")
     return capsys.readouterr().out
@@ -63,6 +64,8 @@ def test_the_last_lines_are_the_verdict_and_how_to_look_at_the_result(
     lines = shown(capsys, {"grade": "usable", "text": "Usable: it is soft."}).splitlines()
     assert lines[-2] == "Usable: it is soft. 1 photograph is left out: b.jpg."
     assert lines[-1] == "Look at it: splat view run"
+    lines = shown(capsys, {"grade": "usable", "text": "It is soft."}, run="my run").splitlines()
+    assert lines[-1] == "Look at it: splat view 'my run'"
 
 
 def test_a_terminal_breaks_the_verdict_between_words(

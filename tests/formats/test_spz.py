@@ -137,6 +137,16 @@ def test_an_outlier_does_not_coarsen_the_steps_of_the_others(tmp_path: Path) -> 
     assert np.delete(error, 4, axis=0).max() <= 0.5 / 2**bits + 1e-6
 
 
+def test_a_scene_far_from_zero_gets_the_steps_that_reach_it(tmp_path: Path) -> None:
+    """On a map grid, with neighbours closer than 16 of these steps."""
+    splats = many_splats(2000)
+    splats.means[:] = splats.means * 0.1 + np.array([2e4, 1e4, 1e2], np.float32)
+    formats.write(tmp_path / "a.spz", splats)
+    assert content_of(tmp_path / "a.spz")[13] == 8
+    error = np.abs(formats.read(tmp_path / "a.spz").means - splats.means)
+    assert error.max() <= 0.5 / 2**8 + 1e-3
+
+
 def test_what_lies_beyond_reach_looks_the_same_from_the_middle(tmp_path: Path) -> None:
     splats = many_splats(9)
     splats.means[4] = (1e9, -5e8, 2e8)

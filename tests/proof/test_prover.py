@@ -398,3 +398,16 @@ def test_of_very_many_splats_the_middle_is_drawn_and_all_are_compared(
     far[outside] += 100
     wrong = written(some, tmp_path, name, replace(scene.splats, means=far))
     assert wrong.figures["max_position_error"] > 50
+
+
+def test_advice_for_splats_on_a_map_grid_works(scene: SmallScene, tmp_path: Path) -> None:
+    """Steps of 1 unit are all that 24 bits hold there."""
+    shift = np.array([500_000, -100, 5_500_000], np.float32)
+    far = replace(scene.splats, means=scene.splats.means + shift)
+    formats.write(tmp_path / "far.spz", far)
+    with pytest.raises(SplatError) as error:
+        Prover.of(far, cameras_for(far)).require(tmp_path / "far.spz", "wrong")
+    assert error.value.hint.startswith("`splat edit --move=-500000,100,-5500000` brings them")
+    near = replace(far, means=far.means - shift)
+    formats.write(tmp_path / "near.spz", near)
+    assert Prover.of(near, cameras_for(near)).require(tmp_path / "near.spz", "wrong").splats
