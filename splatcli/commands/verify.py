@@ -15,6 +15,7 @@ from splatcli.folders import find_run_folder
 from splatcli.photo_check import check_on_photos
 from stages import formats
 from stages.base.errors import QualityError, UsageError
+from stages.base.text import quoted
 from stages.formats import format_of
 from stages.formats.mesh_table import MESHES
 from stages.formats.sog_quantisation import splats_to_write
@@ -34,11 +35,12 @@ class _Original:
     """What files are compared with.
 
     name: for messages. provers_of: one for each model of splats that a file may hold, likeliest
-    first.
+    first. run: that has it in its export folder, if it is a file.
     """
 
     name: str
     provers_of: Callable[[Path], Iterable[Prover]]
+    run: Pipeline | None = None
 
 
 def verify(
@@ -167,7 +169,7 @@ def _of_file(file: Path, views: tuple[View, ...]) -> _Original:
     splats = drop_undrawable(formats.read(file))[0]
     cameras = cameras_for(splats, views)
     prover = Prover.of(splats, cameras, source_format=format_of(file).ending)
-    return _Original(str(file), lambda verified: [prover])
+    return _Original(str(file), lambda verified: [prover], results.run_around(file))
 
 
 def _of_run(run: Pipeline) -> _Original:
@@ -264,9 +266,16 @@ def _raise_if_wrong(proofs: list[tuple[Path, Proof]], original: _Original) -> No
     wrong = [(file, proof.fault) for file, proof in proofs if proof.fault]
     if not wrong:
         return
+    hint = "Write it again with `splat export` or `splat convert`."
+    file = wrong[0][0]
+    if original.run and file.parent.samefile(original.run.stage_folder("export")):
+        hint = (  # formats of one run need not hold the same splats
+            "Formats of a run may be fine-tuned each by itself: "
+            f"splat verify {quoted(file)} --against {quoted(original.run.run_folder)}"
+        )
     raise QualityError(
         "verify-failed",
         given="; ".join(f"{file.name} is wrong: {fault}" for file, fault in wrong) + ".",
         wanted=f"The same splats as in {original.name}.",
-        hint="Write it again with `splat export` or `splat convert`.",
+        hint=hint,
     )

@@ -70,10 +70,12 @@ class Codec:
         if not len(largest) or (low <= largest.min() and largest.max() <= high):
             return "", ""
         why = f"holds sizes from {math.exp(low):.2g} to {math.exp(high):.3g} units"
-        few = np.quantile(largest, _FEW)
-        tens = [math.floor((high - largest.max()) / _TEN), math.ceil((low - few) / _TEN)]
+        few, most = np.quantile(largest, _FEW), largest.max()
+        tens = [math.floor((high - most) / _TEN), math.ceil((low - few) / _TEN)]
         power = min(tens[0], 0) or max(tens[1], 0)
-        return why, f"`splat edit --scale 1e{power}` brings them into that range" if power else ""
+        if not power or few + power * _TEN < low or most + power * _TEN > high:
+            return why, ""
+        return why, f"`splat edit --scale 1e{power}` brings them into that range"
 
 
 _GLTF = Codec(gltf.write, gltf_read.read)

@@ -20,6 +20,7 @@ from stages.proof.compare import Change
 from stages.proof.prover import DROP_OUTLIERS, Proof, Prover
 from stages.scene import Splats
 
+_ROUNDINGS = 4  # of float32, on the way to a file and back
 _WHOLE = ".ply, .glb and .usdz hold them"
 
 
@@ -81,6 +82,9 @@ def changes_shown(path: Path, splats: Splats, proof: Proof) -> dict[str, str]:
 
 
 def _moved(row: Format, splats: Splats, change: Change) -> str:
+    farthest = np.abs(splats.means + splats.origin).max(initial=0.0)
+    if not row.loses and change.largest > _ROUNDINGS * float(np.spacing(np.float32(farthest))):
+        return f"lie elsewhere, by up to {change.largest:.3g} units, which is no rounding"
     outliers = int(np.count_nonzero(outlier_shells(splats.means)))
     far = f", and {counted(outliers, 'outlier')} widened it" if outliers else ""
     return (

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from stages.base.errors import UsageError
+from stages.base.text import quoted
 from stages.formats import read
 from stages.raster.backends import AUTO, runs_here
 from stages.run import runfolder
@@ -104,7 +105,7 @@ def final_splats(pipeline: Pipeline) -> Splats:
                 given=f"In {pipeline.run_folder}, {stale[name]} was made again, and {name} was "
                 "not.",
                 wanted="A run whose stages belong together.",
-                hint="Run `splat process` to finish it.",
+                hint=f"Run `splat process {quoted(pipeline.run_folder)}` to finish it.",
             )
     splats: Splats = pipeline.load("quantise").splats
     return splats
@@ -137,7 +138,8 @@ def run_around(file: Path | None) -> Pipeline | None:
     """The run whose export folder a file lies in: its cameras fit the file."""
     if file is None or not runfolder.is_run_folder(file.absolute().parent.parent):
         return None
-    return Pipeline(file.absolute().parent.parent)
+    run = Pipeline(file.absolute().parent.parent)
+    return run if file.absolute().parent == run.stage_folder("export").absolute() else None
 
 
 def read_file(file: Path, strict: bool = True) -> Splats:

@@ -150,3 +150,12 @@ def test_moved_splats_are_not_written_where_the_cameras_of_a_run_are_taken_for_t
     assert not Path("run/7-export/moved.ply").exists()
     assert splat("edit", "run", "moved.ply", move).exit_code == 0
     assert splat("edit", "run", "run/7-export/less.ply", "--degree", "0").exit_code == 0
+
+
+def test_a_folder_of_ones_own_in_a_run_is_no_export_folder(splat, outputs: Outputs) -> None:
+    Path("run/mine").mkdir()
+    turned = splat("edit", "run", "run/mine/turned.ply", "--rotate=x:180")
+    assert turned.exit_code == 0, turned.stderr
+    assert results.run_around(Path("run/7-export/scene.html")) is not None
+    for name in ("run/mine/turned.ply", "run/4-train/splats.npz"):
+        assert results.run_around(Path(name)) is None

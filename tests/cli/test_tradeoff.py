@@ -108,6 +108,7 @@ def test_a_run_whose_stages_do_not_belong_together_is_reported(splat: Splat) -> 
     assert splat("train", "run", "--steps", "30").exit_code == 0
     assert failed(splat("tradeoff", "run", "--json")) == "run-half-anew"
     assert failed(splat("compare", "run", "run", "--json")) == "run-half-anew"
+    assert "Run `splat process run` to finish it" in splat("compare", "run", "run").stderr
 
 
 @pytest.mark.slow

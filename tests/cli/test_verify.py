@@ -105,6 +105,16 @@ def test_a_run_folder_means_all_its_files(run: Path) -> None:
     assert "itself" not in out + err
 
 
+def test_files_of_one_run_need_not_be_equal(run: Path, scene: SmallScene) -> None:
+    """Each may be fine-tuned to its format."""
+    ply, glb = (run / "7-export" / f"scene.{name}" for name in ("ply", "glb"))
+    formats.write(ply, mirrored(scene.splats))
+    result = CliRunner().invoke(app, ["verify", str(glb), "--against", str(ply)])
+    assert result.exit_code == 7
+    said = "".join(result.stderr.split())
+    assert f"splat verify {glb} --against {run}".replace(" ", "") in said
+
+
 @pytest.mark.parametrize("beside", [("ply",), ()])
 def test_the_meshes_of_a_run_are_not_taken_for_splats(
     run: Path, monkeypatch: pytest.MonkeyPatch, beside: tuple[str, ...]

@@ -102,6 +102,9 @@ def test_one_splat_of_too_small_a_size_does_not_choose_the_scale() -> None:
     assert "--scale 1e-1" in advice
     splats.log_scales[::10] = 0
     assert CODECS["spz"].size_loss(splats) == (why, "")
+    splats.log_scales[:] = -8.5
+    splats.log_scales[3] = np.log(600)  # no scale has room for both
+    assert CODECS["spz"].size_loss(splats) == (why, "")
     assert CODECS["ply"].size_loss(splats) == ("", "")
 
 
@@ -138,3 +141,14 @@ def test_a_file_that_came_out_wrong_replaces_nothing(
     assert f"{name} came out wrong" in result.stderr
     assert {each: (tmp_path / each).read_bytes() for each in kept} == kept
     assert len([*tmp_path.iterdir()]) == 1 + len(kept)
+
+
+def test_a_splat_that_lies_elsewhere_is_not_put_down_to_rounding(tmp_path: Path) -> None:
+    formats.write(tmp_path / "a.ply", solid())
+    formats.write(tmp_path / "b.ply", with_outlier(3))
+    words = ["verify", str(tmp_path / "b.ply"), "--against", str(tmp_path / "a.ply")]
+    result = CliRunner().invoke(app, words)
+    text = " ".join((result.stdout + result.stderr).split())
+    assert "1 of 2,000 splats lie elsewhere, by up to 3.54 units" in text
+    assert "32 bits" not in text
+    assert "hold them" not in text
