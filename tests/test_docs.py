@@ -35,7 +35,7 @@ _NO_CODES = {
     "2-sfm",  # a folder
     "allow-nonfinite",  # an argument of the USD reader's process
     *("in-use", "peak-memory"),  # parts of file names
-    *("no-rotation", "too-large"),  # flags of `splat info`
+    *("no-rotation", "too-large", "vertical-axis"),  # flags of `splat info`
 }
 
 

@@ -56,6 +56,7 @@ def convert(
             prover = Prover.of(splats, cameras, source_format=rows[0].ending)
             figures, losses = require_proven(written, prover, "convert-verify-failed")
     size = rows[1].size_bytes(target)
+    warnings = [*filter(None, [formats.vertical_warning(source, target)]), *losses.values()]
     facts: dict[str, Any] = {
         "source": str(source),
         "target": str(target),
@@ -65,14 +66,14 @@ def convert(
         "bytes_per_splat": round(size / max(1, len(splats)), 2),
         "seconds": round(time.monotonic() - begun, 2),
         **figures,
-        "warnings": [*losses.values()],
+        "warnings": warnings,
     }
     if console.mode.as_json:
         console.emit("converted", **facts)
         return
     if dropped:
         console.warn(f"Warning: {dropped} splats that no viewer can draw were left out.")
-    for warning in losses.values():
+    for warning in warnings:
         console.warn(f"Warning: {warning}")
     _show(facts, figures)
 

@@ -82,7 +82,7 @@ def _edit(
         before, start_db = len(scene.splats), scene.psnr_db()
         facts: dict[str, Any] = {"source": str(source), "splats_before": before}
         steps: list[dict[str, Any]] = []
-        warnings: list[str] = []
+        warnings = _axis_warning(source, target, parsed)
         for one, edited in operations.apply_operations(scene, prepared):
             steps.append(_report(one, len(scene.splats), edited))
             scene = edited
@@ -100,6 +100,13 @@ def _edit(
         what = counted(left_out, "splat")
         warnings.append(f"Left out, because of values that no viewer can draw: {what}.")
     return facts | {"dropped": left_out, "warnings": warnings}
+
+
+def _axis_warning(source: Path, target: Path, parsed: Sequence[ParsedOperation]) -> list[str]:
+    """What is said of a file whose vertical axis is another one, unless the splats are turned."""
+    if not source.is_file() or any(one.name in ("up", "rotate") for one in parsed):
+        return []
+    return [*filter(None, [formats.vertical_warning(source, target)])]
 
 
 def _check_place(target: Path, scene: EditedScene) -> None:

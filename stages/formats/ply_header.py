@@ -70,13 +70,21 @@ class Element:
 
 @dataclass(frozen=True)
 class Header:
-    """origin, place: as in `Splats`. antialias: whether a comment asks for opacity compensation."""
+    """What the header declares.
+
+    Attributes:
+        origin, place: as in `Splats`.
+        antialias: whether a comment asks for opacity compensation.
+        vertical: the axis that a comment calls vertical, such as "z"; "" without one. The values
+            are kept as they are: the cameras of these splats are in the same axes.
+    """
 
     encoding: str
     elements: tuple[Element, ...]
     origin: NDArray[np.float64]
     place: EarthPlace | None
     antialias: bool
+    vertical: str
     data_starts: int
 
     @property
@@ -114,7 +122,7 @@ def read_header(file: BinaryIO) -> Header:
     end = re.search(rb"(?:^|[\r\n])end_header[ \t]*(\r\n|\n|\r)", start)
     if end is None:
         raise BadFileError("its header does not end")
-    encoding, origin, elements = "", np.zeros(3), []
+    encoding, origin, elements, vertical = "", np.zeros(3), [], ""
     stated = None
     said: list[bool] = []
     for line in re.split(r"[\r\n]+", start[: end.start()].decode("utf-8", "replace"))[1:]:
@@ -132,6 +140,7 @@ def read_header(file: BinaryIO) -> Header:
                 elements[-1] = _with_property(elements[-1], rest)
             case ["comment", *words]:
                 said += _antialias(words)
+                vertical = _vertical(words) or vertical
             case [] | ["obj_info", *_]:
                 pass
             case _:
@@ -140,7 +149,7 @@ def read_header(file: BinaryIO) -> Header:
         raise BadFileError(f"its encoding {encoding[:40]!r} is not known")
     antialias = agreed(said, "its comments contradict each other about antialiasing")
     place = place_of(stated, origin)
-    return Header(encoding, tuple(elements), origin, place, antialias, end.end())
+    return Header(encoding, tuple(elements), origin, place, antialias, vertical, end.end())
 
 
 def _antialias(words: list[str]) -> list[bool]:
@@ -152,6 +161,15 @@ def _antialias(words: list[str]) -> list[bool]:
         case ["splatrendermode:", "default"] | ["antialiased", "0"]:
             return [False]
     return []
+
+
+def _vertical(words: list[str]) -> str:
+    """The axis that a comment calls vertical: "" for none. nerfstudio writes "Vertical Axis: z" and
+    means up, Brush "Vertical axis: y" in worlds of y down."""
+    match [word.lower() for word in words]:
+        case ["vertical", "axis:", axis] if re.fullmatch("[-+]?[xyz]", axis):
+            return axis.removeprefix("+")
+    return ""
 
 
 def _count(text: str) -> int:
