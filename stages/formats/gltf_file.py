@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
-from urllib.parse import quote
+from urllib.parse import quote, unquote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -264,6 +265,28 @@ def _write_pair(path: Path, document: dict[str, Any], attributes: Sequence[Attri
     text = json.dumps(document, indent=1, allow_nan=False) + "\n"
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
+
+
+def refuse_taken_buffer(path: Path) -> None:
+    """Raise SplatError "gltf-buffer-taken" where the .bin of a .gltf that is to be written exists
+    and is not the buffer of the .gltf there: it may be anything, such as COLMAP's points3D.bin."""
+    binary = path.with_suffix(".bin")
+    if os.path.lexists(binary) and binary.name not in _buffer_names(path):
+        raise UsageError(
+            "gltf-buffer-taken",
+            given=f"{binary} exists and is not the buffer of an earlier {path.name}.",
+            wanted="A name whose .bin overwrites nothing.",
+            hint="Name another file, or move that one away.",
+        )
+
+
+def _buffer_names(path: Path) -> list[str]:
+    """The names that the buffers of a .gltf have; none where there is no such file."""
+    try:
+        buffers = json.loads(path.read_text(encoding="utf-8"))["buffers"]
+        return [unquote(buffer["uri"]) for buffer in buffers if "uri" in buffer]
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        return []
 
 
 def _size(attributes: Sequence[Attribute]) -> int:

@@ -11,6 +11,7 @@ from stages.base.atomic import remove_abandoned_files, sync_folder, temporary_be
 from stages.base.errors import SplatError, UsageError
 from stages.formats.codecs import CODECS
 from stages.formats.format_table import format_of
+from stages.formats.gltf_file import refuse_taken_buffer
 from stages.formats.offset import offset_path
 
 _LONGEST_NAME_BYTES = 220  # of the 255 that file systems allow
@@ -36,8 +37,9 @@ def replacing_asset(path: Path) -> Iterator[Path]:
 
 def check_target(path: Path, no_clobber: bool, source: Path | None = None) -> None:
     """Raise SplatError for a file that must not be written: "target-is-source" for `source`,
-    "target-exists" with `no_clobber` if it, or a file that belongs to it, exists, "name-too-long"
-    where names that are made of it would be too long for a file system."""
+    "target-exists" with `no_clobber` if it, or a file that belongs to it, exists,
+    "gltf-buffer-taken" where another file has the name of its buffer, "name-too-long" where names
+    that are made of it would be too long for a file system."""
     row = format_of(path)
     if (length := len(os.fsencode(path.name))) > _LONGEST_NAME_BYTES:
         raise SplatError(
@@ -62,3 +64,5 @@ def check_target(path: Path, no_clobber: bool, source: Path | None = None) -> No
                 wanted="A new name, because of --no-clobber.",
                 hint="Name another file, or leave --no-clobber away.",
             )
+    if row.ending == "gltf":
+        refuse_taken_buffer(path)

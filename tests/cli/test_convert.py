@@ -310,6 +310,31 @@ def test_no_clobber_refuses_to_replace_a_file(
     assert (tmp_path / taken).read_text() == "mine"
 
 
+@pytest.mark.parametrize("command", [["convert"], ["edit", "--scale", "2"]])
+@pytest.mark.parametrize("beside", ["", "{", "[]", '{"buffers": [{"uri": "other.bin"}, {}, 1]}'])
+def test_a_gltf_does_not_overwrite_a_bin_that_is_not_its_buffer(
+    tmp_path: Path, command: list[str], beside: str
+) -> None:
+    formats.write(tmp_path / "a.ply", many_splats(20))
+    (tmp_path / "points3D.bin").write_text("mine")
+    if beside:
+        (tmp_path / "points3D.gltf").write_text(beside)
+    words = [command[0], str(tmp_path / "a.ply"), str(tmp_path / "points3D.gltf"), *command[1:]]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 2, result.stderr
+    assert "gltf-buffer-taken" in result.stderr
+    assert (tmp_path / "points3D.bin").read_text() == "mine"
+    assert (tmp_path / "points3D.gltf").exists() == bool(beside)
+
+
+def test_a_gltf_and_its_own_buffer_are_replaced(tmp_path: Path) -> None:
+    target = tmp_path / "a scene%20.gltf"
+    for count in (20, 30):
+        formats.write(tmp_path / "a.ply", many_splats(count))
+        converted(tmp_path / "a.ply", target)
+        assert len(formats.read(target)) == count
+
+
 @pytest.mark.parametrize("name", ["b.gltf", "lod-meta.json"])
 def test_a_conversion_that_fails_its_check_leaves_the_earlier_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
