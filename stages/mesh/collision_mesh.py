@@ -22,6 +22,7 @@ _COVERED_VOXELS = 2.0  # largest distance of a covered surface from the mesh
 _SAMPLES = 200_000  # pixels that the covered share is measured on
 _SAMPLES_PER_VOXEL = 4  # random points of the mesh for each face of a voxel that it fills
 _LOW_COVERAGE = 0.7
+_MANY = 1.05  # times the wanted number of triangles, which is meant to be about that
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,8 @@ def make_collision_mesh(
     """The mesh of what the training cameras see, with at most about `triangles` triangles.
 
     Equal inputs give an equal mesh, unless a lack of memory enlarges the voxels.
-    Warnings: export-mesh-empty, export-mesh-coarse, export-mesh-gaps. Raises Interrupted.
+    Warnings: export-mesh-empty, export-mesh-coarse, export-mesh-gaps, export-mesh-triangles.
+    Raises Interrupted.
     """
     training, _ = split_held_out(reconstruction.views)
     cameras = depth_maps.select_cameras([view.camera for view in training])
@@ -83,6 +85,7 @@ def make_collision_mesh(
         "covered_share": covered,
     }
     _warn_of_gaps(covered, report)
+    _warn_of_many(len(mesh.faces), triangles, report)
     return CollisionMesh(mesh, figures)
 
 
@@ -101,6 +104,15 @@ def _warn_of_gaps(covered: float, report: Report) -> None:
             "export-mesh-gaps",
             f"The mesh covers only {covered:.0%} of what the training photographs show; the rest "
             "is far away, or its depth differs between cameras.",
+        )
+
+
+def _warn_of_many(count: int, wanted: int, report: Report) -> None:
+    if count > _MANY * wanted:
+        report.warn(
+            "export-mesh-triangles",
+            f"The mesh has {count:,} triangles instead of {wanted:,}: its borders and holes need "
+            "them.",
         )
 
 

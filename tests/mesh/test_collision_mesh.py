@@ -6,13 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from stages.base.errors import Interrupted
 from stages.base.stage import Report
-from stages.mesh import fuse
+from stages.mesh import extract, fuse
 from stages.mesh.collision_mesh import CollisionMesh, make_collision_mesh
+from stages.mesh.extract import extract_surface, remove_small_components, simplify
+from stages.mesh.fuse import Volume
 from stages.raster.kernels.pool import Pool
 from stages.scene import Reconstruction, Splats
+from stages.scene.mesh import Mesh
 from tests.mesh.shapes import (
     CENTRE,
     all_around,
@@ -61,6 +65,31 @@ def test_fewer_triangles_keep_the_shape() -> None:
     assert 700 < found.figures["triangles"] <= 800
     radii = np.linalg.norm(found.mesh.vertices - CENTRE, axis=1)
     assert np.abs(radii - 1).max() < 2 * MESH_VOXELS * found.figures["voxel"]
+
+
+def ragged() -> Mesh:
+    """A rough surface with holes, borders and edges of more than two faces."""
+    random, shape = np.random.default_rng(0), (48, 48, 48)
+    distance = np.clip(30 * gaussian_filter(random.normal(size=shape), 1.5), -4, 4)
+    weight = gaussian_filter(random.normal(size=shape), 1) < 0.03
+    volume = Volume(distance.astype("f4"), weight.astype("f4"), np.full(3, -1.0), 1 / 24)
+    return remove_small_components(extract_surface(volume))[0]
+
+
+def test_a_ragged_surface_is_simplified_as_far_as_wanted_or_possible() -> None:
+    mesh = ragged()
+    assert len(mesh.faces) > 8000
+    for triangles in (4000, 800):
+        assert 0.9 * triangles < len(simplify(mesh, triangles).faces) <= 1.05 * triangles
+    assert 10 < len(simplify(mesh, 10).faces) < 800  # it ends, though it cannot get there
+
+
+def test_more_triangles_than_wanted_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(extract, "extract_surface", lambda volume: ragged())
+    found, report = made(sphere(), all_around(3), triangles=100)
+    assert found.figures["triangles"] > 105
+    (warning,) = (text for code, text in report.warnings if code == "export-mesh-triangles")
+    assert f"{found.figures['triangles']:,} triangles instead of 100" in warning
 
 
 def test_one_camera_gives_what_it_sees_and_no_shell_behind_it() -> None:
