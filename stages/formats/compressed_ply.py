@@ -37,6 +37,9 @@ CHUNK = 256
 # The logarithm -87 of a flat splat would take the precision of its whole chunk. Scales below
 # exp(-20) or above exp(20) units look the same at the limit.
 LOG_SCALE_LIMIT = 20.0
+# One extreme colour would take the 8 bits of its whole chunk. 1 is white; the colours of trained
+# scenes lie within -0.5..2.5.
+COLOUR_LIMIT = 4.0
 # Splats farther from the median centre than this many extents of the scene are outliers. They are
 # sorted into shells, each this many times as wide as the one before.
 _OUTLIER_EXTENTS, _SHELL_RATIO = 4.0, 4.0
@@ -56,8 +59,8 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
     """Write `splats`.
 
     Positions stay relative to `splats.origin`, which a comment holds. All splats get one SH
-    degree, and coefficients are clipped to -4..4. Raises SplatError when the file cannot be
-    written.
+    degree, and coefficients and colours are clipped to -4..4. Raises SplatError when the file
+    cannot be written.
     """
     degree = int(splats.sh_degrees.max(initial=0))
     splats, rows = splats.with_sh_degree(degree), order(splats)
@@ -126,6 +129,7 @@ def _header_text(splats: Splats, degree: int, units: str) -> bytes:
 def _pack(splats: Splats) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """(ranges [chunks, 18] float32, words [N, 4] uint32, SH [N, 3K] uint8) of whole chunks."""
     colours = 0.5 + SH_C0 * splats.sh[:, 0].astype(np.float64)
+    colours = np.clip(colours, -COLOUR_LIMIT, COLOUR_LIMIT)
     scales = np.clip(splats.log_scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)
     positions, ranges = _within_chunks(splats.means)
     scale_fractions, scale_ranges = _within_chunks(scales)

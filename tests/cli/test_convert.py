@@ -166,6 +166,13 @@ def test_splats_out_of_range_are_counted_and_reported(tmp_path: Path) -> None:
     assert "24 bits" in json.loads(out.splitlines()[-1])["warnings"][0]
 
 
+def test_one_extreme_colour_does_not_refuse_the_file(tmp_path: Path) -> None:
+    splats = many_splats(200)  # one chunk
+    splats.sh[7, 0, 0] = 1e20
+    formats.write(tmp_path / "a.ply", splats)
+    converted(tmp_path / "a.ply", tmp_path / "b.compressed.ply")
+
+
 def test_outliers_that_coarsen_the_positions_of_a_sog_are_told(tmp_path: Path) -> None:
     splats = replace(many_splats(2000), origin=np.zeros(3))
     splats.sh[:, 1:] = 0

@@ -135,6 +135,16 @@ def test_a_flat_splat_spoils_no_positions(tmp_path: Path) -> None:
     assert (errors > 0.01).sum() < 256
 
 
+@pytest.mark.parametrize("extreme", [1e20, -1e20, 60.0])
+def test_an_extreme_colour_spoils_no_others(tmp_path: Path, extreme: float) -> None:
+    splats = many_splats(200)  # one chunk
+    splats.sh[77, 0, 0] = extreme
+    formats.write(tmp_path / "a.compressed.ply", splats)
+    back = C0 * formats.read(tmp_path / "a.compressed.ply").sh[:, 0]
+    wanted = C0 * splats.take(compressed_ply.order(splats)).sh[:, 0]
+    np.testing.assert_allclose(0.5 + back, np.clip(0.5 + wanted, -4, 4), atol=4 / 255)
+
+
 def test_extremes_stay_finite(tmp_path: Path) -> None:
     splats = extreme_splats(1)
     splats.sh[2, 0] = 3.4e38
