@@ -257,7 +257,7 @@ class _Source:
             _check_drawing(said)
             return self._spz(whole(compressions[SPZ_EXTENSION], "bufferView"), scale, offset)
         _check_drawing(extension)
-        if "extensions" in extension:
+        if extension.get("extensions"):
             raise BadFileError("its splats are compressed in a way that is not supported")
         attributes = primitive.get("attributes")
         if not isinstance(attributes, dict):

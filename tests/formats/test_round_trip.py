@@ -174,6 +174,18 @@ def test_a_gltf_node_may_move_and_scale_its_splats(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.exp(back.log_scales), [[0.2, 0.4, 0.8]], rtol=1e-6)
 
 
+def test_a_gltf_with_an_empty_list_of_compressions_is_not_compressed(tmp_path: Path) -> None:
+    path = tmp_path / "a.glb"
+    formats.write(path, red_splat())
+
+    def edit(document: dict[str, Any]) -> None:
+        primitive = document["meshes"][0]["primitives"][0]
+        primitive["extensions"]["KHR_gaussian_splatting"]["extensions"] = {}
+
+    edited_glb(path, edit)
+    np.testing.assert_array_equal(formats.read(path).means, red_splat().means)
+
+
 def test_gltf_integers_are_decoded_as_the_specification_says(tmp_path: Path) -> None:
     path = tmp_path / "a.glb"
     formats.write(path, red_splat())
