@@ -13,6 +13,7 @@ from splatcli.arguments import RunOrFile
 from splatcli.folders import load_target
 from stages import formats
 from stages.base import scratch
+from stages.base.text import counted
 from stages.formats import format_of
 from stages.proof.statistics import (
     NEEDLE_ASPECT,
@@ -86,24 +87,27 @@ def warnings_of(statistics: Statistics) -> list[tuple[str, str]]:
     """(code, sentence) for each kind of defect that is there."""
     warnings = []
     for name, count in statistics.not_finite.items():
-        what = f"{_share(count, statistics)} not finite in their {_ATTRIBUTES[name]}"
-        warnings.append((f"not-finite-{_ATTRIBUTES[name]}", f"{what}: no viewer can draw them."))
+        what = f"{{are}} not finite in {{their}} {_ATTRIBUTES[name]}: no viewer can draw {{them}}."
+        warnings.append((f"not-finite-{_ATTRIBUTES[name]}", _sentence(count, statistics, what)))
     kinds = {
-        "no-rotation": "without a rotation: no viewer can draw them.",
-        "too-large": "larger than numbers go: no viewer can draw them.",
-        "transparent": "below an opacity of 1/255, and so never seen.",
-        "needles": f"needles, over {NEEDLE_ASPECT:g} times as long as wide.",
-        "outliers": f"outliers, over {OUTLIER_BOXES:g} times as far out as the middle 98 %.",
+        "no-rotation": "{are} without a rotation: no viewer can draw {them}.",
+        "too-large": "{are} larger than numbers go: no viewer can draw {them}.",
+        "transparent": "{are} below an opacity of 1/255, and so never seen.",
+        "needles": f"{{are}} over {NEEDLE_ASPECT:g} times as long as wide, like needles.",
+        "outliers": f"{{are}} over {OUTLIER_BOXES:g} times as far out as the middle 98 %.",
     }
     for code, what in kinds.items():
         if count := statistics.troubles.get(code, 0):
-            warnings.append((code, f"{_share(count, statistics)} {what}"))
+            warnings.append((code, _sentence(count, statistics, what)))
     return warnings
 
 
-def _share(count: int, statistics: Statistics) -> str:
-    """ "12 splats (0.03 %) are"."""
-    return f"{count:,} splats ({100 * count / statistics.count:.2g} %) are"
+def _sentence(count: int, statistics: Statistics, what: str) -> str:
+    """ "12 splats (0.03 %) are ...". what: the rest, with fields for words that depend on the
+    number."""
+    words = ("is", "its", "it") if count == 1 else ("are", "their", "them")
+    rest = what.format(**dict(zip(("are", "their", "them"), words, strict=True)))
+    return f"{counted(count, 'splat')} ({100 * count / statistics.count:.2g} %) {rest}"
 
 
 def _about_file(path: Path, count: int) -> dict[str, Any]:

@@ -41,7 +41,8 @@ def test_values_that_are_not_finite_are_described_and_not_refused(tmp_path: Path
     facts = info(path)
     assert facts["not_finite"] == 6
     assert facts["warnings"]["not-finite-positions"].startswith("5 splats")
-    assert facts["warnings"]["not-finite-rotations"].startswith("1 splats")
+    wanted = "1 splat (0.33 %) is not finite in its rotations: no viewer can draw it."
+    assert facts["warnings"]["not-finite-rotations"] == wanted
     assert np.isfinite(facts["bounds_high"]).all()
     result = CliRunner().invoke(app, ["info", str(path)])
     assert result.exit_code == 0
@@ -70,7 +71,7 @@ def test_a_usd_file_that_is_not_finite_is_described_too(tmp_path: Path) -> None:
     text = path.read_text()
     place = text.index("positions = [(") + len("positions = [(")
     path.write_text(text[:place] + "nan" + text[text.index(",", place) :])
-    assert info(path)["warnings"]["not-finite-positions"].startswith("1 splats")
+    assert info(path)["warnings"]["not-finite-positions"].startswith("1 splat (")
 
 
 @pytest.mark.parametrize(("suffix", "floats"), [("ply", 59), ("splat", 14)])
