@@ -18,6 +18,7 @@ from stages.editing import levels
 from stages.formats import format_of
 from stages.formats.replacement import check_target, replacing_asset
 from stages.formats.values import nothing_drawable
+from stages.formats.vertical_axis import vertical_warning
 from stages.proof.losses import require_proven
 from stages.proof.prover import Prover, cameras_for
 from stages.run import results
@@ -56,7 +57,7 @@ def convert(
             prover = Prover.of(splats, cameras, source_format=rows[0].ending)
             figures, losses = require_proven(written, prover, "convert-verify-failed")
     size = rows[1].size_bytes(target)
-    warnings = [*filter(None, [formats.vertical_warning(source, target)]), *losses.values()]
+    warnings = [*filter(None, [vertical_warning(source, target)]), *losses.values()]
     facts: dict[str, Any] = {
         "source": str(source),
         "target": str(target),

@@ -25,6 +25,7 @@ from stages.evaluate.evaluation import load_evaluation_views
 from stages.formats import format_of, units_of
 from stages.formats.replacement import check_target, replacing_asset
 from stages.formats.values import drop_undrawable, nothing_drawable
+from stages.formats.vertical_axis import vertical_warning
 from stages.proof.losses import require_proven
 from stages.proof.prover import Prover, cameras_for
 from stages.run import results
@@ -106,7 +107,7 @@ def _axis_warning(source: Path, target: Path, parsed: Sequence[ParsedOperation])
     """What is said of a file whose vertical axis is another one, unless the splats are turned."""
     if not source.is_file() or any(one.name in ("up", "rotate") for one in parsed):
         return []
-    return [*filter(None, [formats.vertical_warning(source, target)])]
+    return [*filter(None, [vertical_warning(source, target)])]
 
 
 def _check_place(target: Path, scene: EditedScene) -> None:

@@ -11,10 +11,10 @@ import numpy as np
 from splatcli import console
 from splatcli.arguments import RunOrFile
 from splatcli.folders import load_target
-from stages import formats
 from stages.base import scratch
 from stages.base.text import counted
 from stages.formats import format_of
+from stages.formats.vertical_axis import vertical_warning
 from stages.proof.statistics import (
     NEEDLE_ASPECT,
     OUTLIER_BOXES,
@@ -47,7 +47,7 @@ def info(target: RunOrFile = None) -> None:
     if pipeline is not None:
         facts = {**_about_run(pipeline), **facts}
     warnings = warnings_of(statistics)
-    if pipeline is None and target is not None and (lying := formats.vertical_warning(target)):
+    if pipeline is None and target is not None and (lying := vertical_warning(target)):
         warnings.append(("vertical-axis", lying))
     if console.mode.as_json:
         console.emit("info", **facts, warnings=dict(warnings))

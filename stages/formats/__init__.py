@@ -30,7 +30,6 @@ from typing import TYPE_CHECKING, Any
 
 from stages.base.atomic import remove_abandoned_files
 from stages.base.bad_files import reading
-from stages.base.text import quoted
 from stages.formats.format_table import BY_ENDING, FORMATS, Format, format_of
 
 if TYPE_CHECKING:
@@ -43,7 +42,6 @@ __all__ = [
     "format_of",
     "read",
     "units_of",
-    "vertical_warning",
     "write",
 ]
 _START_BYTES = 1 << 16
@@ -137,24 +135,3 @@ def units_of(path: Path) -> str:
         with reading(path), path.open("rb") as file:
             declared = "metres" if _METRES.search(file.read(_START_BYTES)) else ""
     return "metres" if declared == "metres" else "arbitrary"
-
-
-def vertical_warning(path: Path, target: Path | None = None) -> str:
-    """A sentence where a comment of a .ply says that another axis than y is vertical, which would
-    lie on its side in viewers; else "". target: the file that is written, for the advice. Raises
-    SplatError as `format_of`, or "splats-unreadable"."""
-    from stages.formats.ply_header import read_header  # it loads NumPy, the table does not
-
-    path = Path(path)
-    if format_of(path).ending not in ("ply", "compressed.ply"):
-        return ""
-    with reading(path), path.open("rb") as file:
-        axis = read_header(file).vertical
-    if axis.removeprefix("-") in ("", "y"):  # Brush says "y" of worlds of y down
-        return ""
-    up = axis if axis.startswith("-") else f"+{axis}"
-    turned = f"splat edit {quoted(path)} {quoted(target or 'upright.ply')} --up {up}"
-    return (
-        f"{path} says that its vertical axis is {axis}. Here y points down, so the scene lies on "
-        f"its side: `{turned}` turns it upright."
-    )
