@@ -45,7 +45,7 @@ class ExportSettings:
 
 STAGE = Stage(
     "export",
-    version=15,
+    version=16,
     reads=("sfm", "quantise"),
     settings_type=ExportSettings,
     adds="formats",
