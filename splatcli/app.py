@@ -20,7 +20,7 @@ from typer.main import get_command
 from splatcli import run_settings
 from splatcli.arguments import AS_JSON, QUIET, VERBOSE
 from splatcli.command_group import CommandGroup
-from splatcli.console import guarded
+from splatcli.console import guarded, take_any_output
 from splatcli.help import HelpedCommand
 from splatcli.operation_options import OrderedCommand, operation_parameters
 from splatcli.options import parameters, with_parameters
@@ -234,4 +234,5 @@ def _options(
 
 def main() -> None:
     """Entry point of the `splat` command."""
+    take_any_output()
     watched(app)

@@ -11,7 +11,7 @@ from typer.core import TyperGroup
 
 from splatcli import console
 from splatcli.help import print_help
-from stages.base.errors import Family, SplatError, UsageError
+from stages.base.errors import Family, ResourceError, SplatError, UsageError
 
 _UsageError: Any = typer.BadParameter.__base__  # typer does not export it
 
@@ -44,7 +44,8 @@ class CommandGroup(TyperGroup):
         except SplatError as error:
             status = console.show_error(error)
         except OSError as error:
-            status = console.show_error(console.output_lost(error))
+            lost = console.output_lost if error.filename is None else _not_installed
+            status = console.show_error(lost(error))
         except _UsageError as error:
             if type(error).__name__ == "NoArgsIsHelpError":  # it has shown the help
                 status = int(Family.USAGE)
@@ -53,6 +54,16 @@ class CommandGroup(TyperGroup):
         if standalone_mode:
             sys.exit(status)
         return status
+
+
+def _not_installed(error: OSError) -> SplatError:
+    """Of the parser's own options, `--install-completion` alone writes files."""
+    return ResourceError(
+        "completion-not-installed",
+        given=f"{error.filename}: {error.strerror}.",
+        wanted="A home folder that can be written to.",
+        hint="Put what `splat --show-completion` prints into a file that your shell reads.",
+    )
 
 
 def _as_splat_error(error: Any) -> SplatError:

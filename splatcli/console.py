@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import io
 import json
 import os
 import re
@@ -25,6 +26,16 @@ from stages.base.errors import CRASHED, STOPPED, Interrupted, ResourceError, Spl
 from stages.base.text import printable, printable_name
 from stages.base.text import size as size
 from stages.run.failures import as_splat_error
+
+
+def take_any_output() -> None:
+    """Characters that standard output cannot encode, as of paths on Windows, become escapes. Where
+    it or standard error is closed, what is printed there is lost."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 @contextmanager
