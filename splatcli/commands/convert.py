@@ -14,6 +14,7 @@ from stages import formats
 from stages.base import scratch
 from stages.base.atomic import make_folder
 from stages.base.errors import UsageError
+from stages.base.text import counted
 from stages.editing import levels
 from stages.formats import format_of
 from stages.formats.replacement import check_target, replacing_asset
@@ -73,7 +74,9 @@ def convert(
         console.emit("converted", **facts)
         return
     if dropped:
-        console.warn(f"Warning: {dropped} splats that no viewer can draw were left out.")
+        console.warn(
+            f"Warning: Left out, because no viewer can draw it: {counted(dropped, 'splat')}."
+        )
     for warning in warnings:
         console.warn(f"Warning: {warning}")
     _show(facts, figures)
@@ -94,7 +97,7 @@ def _refuse_nothing(source: Path, target: Path, splats: Splats, dropped: int) ->
 
 
 def _show(facts: dict[str, Any], figures: dict[str, Any]) -> None:
-    size = f"{facts['splats']:,} splats, {console.size(facts['size_bytes'])}"
+    size = f"{counted(facts['splats'], 'splat')}, {console.size(facts['size_bytes'])}"
     quality = console.fidelity(figures["verify_db"])
     alike = not facts["warnings"] and console.EXACT_DB > figures["verify_db"] >= _UNSEEN_DB
     seen = ", no difference is seen" if alike else ""

@@ -192,14 +192,14 @@ def _report(parsed: ParsedOperation, before: int, scene: EditedScene) -> dict[st
     if console.mode.as_json:
         console.emit("operation", **facts)
     elif not console.mode.quiet:
-        console.note(f"{parsed}: {before:,} -> {after:,} splats{_quality_text(facts)}")
+        console.note(f"{parsed}: {before:,} -> {counted(after, 'splat')}{_quality_text(facts)}")
     return facts
 
 
 def _show(facts: dict[str, Any]) -> None:
     for warning in facts["warnings"]:
         console.warn(f"Warning: {warning}")
-    result = f"{facts['splats']:,} splats, {facts['splats_before']:,} before"
+    result = f"{counted(facts['splats'], 'splat')}, {facts['splats_before']:,} before"
     result += _quality_text(facts)
     if "psnr_db" in facts:
         result += f" ({facts['psnr_db'] - facts['psnr_before_db']:+.2f})"

@@ -23,6 +23,7 @@ from stages.base import memory
 from stages.base.errors import Interrupted, ResourceError, UsageError
 from stages.base.interrupt import stop_on_signals
 from stages.base.settings import changed
+from stages.base.text import counted
 from stages.raster.definition import Rendering
 from stages.raster.draw import renderer, supersampled
 from stages.run import results
@@ -183,4 +184,4 @@ def _print(out: Path, kind: str, facts: dict[str, Any]) -> None:
     rate = ""
     if "frames_a_second" in facts:
         rate = f", drawn at {facts['frames_a_second']:.3g} frames a second"
-    console.note(f"{out}: {many}{size}, {facts['splats']:,} splats{rate}")
+    console.note(f"{out}: {many}{size}, {counted(facts['splats'], 'splat')}{rate}")

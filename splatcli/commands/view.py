@@ -20,6 +20,7 @@ from splatcli.options import number
 from stages.base import interrupt, scratch
 from stages.base.atomic import partial_prefix, remove_abandoned_files
 from stages.base.errors import SplatError, UsageError
+from stages.base.text import counted
 from stages.editing.regions import parse_numbers
 from stages.formats import format_of, html, ply, units_of
 from stages.formats.replacement import check_target
@@ -144,7 +145,7 @@ def _save(
     if console.mode.as_json:
         console.emit("saved", out=str(path), splats=len(splats), size_bytes=size)
     else:
-        console.note(f"{path}: {len(splats):,} splats, {console.size(size)}.")
+        console.note(f"{path}: {counted(len(splats), 'splat')}, {console.size(size)}.")
 
 
 def _units(target: Path | None, pipeline: Pipeline | None) -> str:
@@ -204,7 +205,7 @@ def _serve(server: LocalServer, count: int, open_browser: bool) -> None:
             console.emit("view", address=server.address, splats=count)
         else:
             console.out.print(server.address)
-            console.note(f"{count:,} splats. Ctrl-C ends it.")
+            console.note(f"{counted(count, 'splat')}. Ctrl-C ends it.")
         if open_browser and not open_in_browser(server.address):
             console.note("No browser could be opened; open the address yourself.")
         server.serve_forever()

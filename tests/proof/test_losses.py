@@ -127,7 +127,8 @@ def test_splats_none_of_which_can_be_drawn_are_refused(tmp_path: Path, command: 
 def test_a_file_that_came_out_wrong_replaces_nothing(
     tmp_path: Path, command: list[str], name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    kept = {name: b"good", f"{name}.offset.json": b"{}", "b.bin": b"good"}
+    earlier = b'{"buffers": [{"uri": "b.bin"}]}'  # b.bin belongs to it
+    kept = {name: earlier, f"{name}.offset.json": b"{}", "b.bin": b"good"}
     for each, content in kept.items():
         (tmp_path / each).write_bytes(content)
     formats.write(tmp_path / "a.ply", solid(50))
