@@ -149,12 +149,26 @@ def make_folder(folder: Path) -> None:
 
 def _refused(path: Path, error: OSError) -> SplatError:
     reason = error.strerror or str(error)
+    folder = _lasting(path.parent)
     # NumPy and the USD library do not say why a write failed.
-    if error.errno in DISK_FULL or (error.errno is None and is_full(path.parent)):
-        return disk_full(f"writing {path.name}", path.parent)
+    if error.errno in DISK_FULL or (error.errno is None and is_full(folder)):
+        return disk_full(f"writing {path.name}", folder)
+    wanted = "Its folder must exist and be writable."
+    hint = "Check the folder's permissions, or choose another one."
+    if error.errno == errno.EFBIG:
+        wanted = "A place that holds files of this size: FAT32 ends at 4 GiB, `ulimit -f` earlier."
+        hint = "Choose another place, or raise the limit."
     return ResourceError(
         "file-not-written",
-        given=f"{path} could not be written: {reason}.",
-        wanted="Its folder must exist and be writable.",
-        hint="Check the folder's permissions, or choose another one.",
+        given=f"{folder / path.name} could not be written: {reason}.",
+        wanted=wanted,
+        hint=hint,
     )
+
+
+def _lasting(folder: Path) -> Path:
+    """The folder that stays of a temporary one of `temporary_beside`, which nobody would find."""
+    for parent in (folder, *folder.parents):
+        if parent.name.startswith(_PARTIAL):
+            return _lasting(parent.parent)
+    return folder

@@ -14,6 +14,7 @@ import pytest
 
 from stages.base import atomic
 from stages.base.atomic import partial_prefix, remove_abandoned_files, replacing
+from stages.base.errors import ResourceError
 
 
 def ended() -> str:
@@ -103,3 +104,22 @@ def test_folder_that_cannot_be_flushed_is_no_failure(
     with replacing(tmp_path / "a.txt") as path:
         path.write_text("a")
     assert (tmp_path / "a.txt").read_text() == "a"
+
+
+def test_a_file_that_is_too_large_for_its_place_is_no_matter_of_permissions(tmp_path: Path) -> None:
+    with pytest.raises(ResourceError) as error, replacing(tmp_path / "a"):
+        raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
+    assert error.value.code == "file-not-written"
+    assert "FAT32" in error.value.wanted
+    assert "permissions" not in error.value.hint
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO])
+def test_errors_name_the_folder_that_stays(tmp_path: Path, number: int) -> None:
+    inner = tmp_path / f"{partial_prefix()}a" / "scene" / f"{partial_prefix()}b"
+    inner.mkdir(parents=True)
+    with pytest.raises(ResourceError) as error, replacing(inner / "scene.ply"):
+        raise OSError(number, os.strerror(number))
+    assert str(tmp_path) in error.value.given
+    assert ".partial-" not in error.value.given
+    assert "scene.ply" in error.value.given
