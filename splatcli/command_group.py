@@ -57,7 +57,7 @@ class CommandGroup(TyperGroup):
 
 
 def _not_installed(error: OSError) -> SplatError:
-    """Of the parser's own options, `--install-completion` alone writes files."""
+    """Of the parser's own options, the one that installs completion alone writes files."""
     return ResourceError(
         "completion-not-installed",
         given=f"{error.filename}: {error.strerror}.",
