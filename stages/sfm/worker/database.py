@@ -14,7 +14,19 @@ from threading import Lock
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.base.errors import ResourceError, SplatError
+
 _MAX_IMAGES = 2147483647  # COLMAP: pair id = first id x this + second id, first < second
+_NO_DAMAGE = {  # primary result codes of SQLite that say nothing of the file
+    sqlite3.SQLITE_BUSY,
+    sqlite3.SQLITE_LOCKED,
+    sqlite3.SQLITE_NOMEM,
+    sqlite3.SQLITE_READONLY,
+    sqlite3.SQLITE_IOERR,
+    sqlite3.SQLITE_FULL,
+    sqlite3.SQLITE_CANTOPEN,
+    sqlite3.SQLITE_PERM,
+}
 _KEYPOINT = 4  # numbers per keypoint, see `features.sift_features`
 
 
@@ -78,17 +90,30 @@ def usable(database: Path, *dependents: Path) -> bool:
     `dependents` that tell what it holds with it.
 
     COLMAP does not wait for the disk, so a power cut can leave a database with missing pages.
+    Raises SplatError "sfm-database-refused" where it may be whole and cannot be read or written.
     """
     if database.exists():
         try:
             repair(database)
             _check_pages(database)
             return True
-        except sqlite3.DatabaseError:
+        except sqlite3.DatabaseError as error:
+            if getattr(error, "sqlite_errorcode", 0) & 0xFF in _NO_DAMAGE:
+                raise _refused(database, error) from error
             delete(database)
     for path in dependents:
         path.unlink(missing_ok=True)
     return False
+
+
+def _refused(database: Path, error: sqlite3.DatabaseError) -> SplatError:
+    return ResourceError(
+        "sfm-database-refused",
+        given=f"{database} cannot be read or written now: {error}.",
+        wanted="A database that no other program has open, on a disk with free space.",
+        hint="Close programs that have it open, free some space, and run the same command again. "
+        "If that does not help, delete the file.",
+    )
 
 
 def _check_pages(database: Path) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from stages.base.errors import ResourceError
 from stages.sfm.worker import database as sqlite
 
 PAIR = 2147483647
@@ -55,7 +56,7 @@ def test_a_file_that_is_no_database_raises_and_can_be_deleted(tmp_path: Path) ->
     assert not garbage.exists()
 
 
-@pytest.mark.parametrize("damage", ["garbage", "empty", "pages", "missing"])
+@pytest.mark.parametrize("damage", ["garbage", "empty", "pages", "cut", "header", "missing"])
 def test_a_damaged_database_takes_the_files_along_that_say_what_it_holds(
     tmp_path: Path, damage: str
 ) -> None:
@@ -72,9 +73,24 @@ def test_a_damaged_database_takes_the_files_along_that_say_what_it_holds(
     middle = len(content) - 50_000
     pages = content[:middle] + bytes(8192) + content[middle + 8192 :]
     damaged = {"garbage": b"no database" * 100, "empty": b"", "pages": pages}
+    damaged |= {"cut": content[:middle], "header": content[:50]}
     if damage == "missing":
         path.unlink()
     else:
         path.write_bytes(damaged[damage])
     assert not sqlite.usable(path, *markers)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_database_that_is_in_use_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, marker = make(tmp_path / "a.db"), tmp_path / "a.done"
+    marker.touch()
+    connect = sqlite3.connect
+    monkeypatch.setattr(sqlite3, "connect", lambda name, **_: connect(name, timeout=0.0))
+    with closing(connect(path)) as other:
+        other.execute("BEGIN EXCLUSIVE")
+        with pytest.raises(ResourceError, match="locked") as error:
+            sqlite.usable(path, marker)
+    assert error.value.code == "sfm-database-refused"
+    assert marker.exists()
+    assert sqlite.usable(path, marker)
