@@ -74,9 +74,8 @@ def convert(
         console.emit("converted", **facts)
         return
     if dropped:
-        console.warn(
-            f"Warning: Left out, because no viewer can draw it: {counted(dropped, 'splat')}."
-        )
+        what = counted(dropped, "splat")
+        console.warn(f"Warning: Left out, because of values that no viewer can draw: {what}.")
     for warning in warnings:
         console.warn(f"Warning: {warning}")
     _show(facts, figures)

@@ -139,7 +139,7 @@ def test_splats_that_cannot_be_drawn_are_counted(tmp_path: Path) -> None:
     huge = np.float32(60).tobytes()  # exp(60) cannot be squared in float32
     (tmp_path / "a.ply").write_bytes(content[:-20] + huge + content[-16:])
     _, err = converted(tmp_path / "a.ply", tmp_path / "b.spz")
-    assert "it: 1 splat." in err
+    assert "draw: 1 splat." in err
     assert "4 splats" in err
 
 
