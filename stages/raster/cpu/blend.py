@@ -179,7 +179,7 @@ def blend_tile(tile_x, tile_y, start, end, alive, members, masks, geometry, pain
                 vstore(work, DEPTH + at, vfma(weight, z, vload(work, DEPTH + at)))
                 halved = vand(vge(passing, splat16(_HALF)), vgt(splat16(_HALF), left))
                 vstore(work, MEDIAN + at, vselect(halved, z, vload(work, MEDIAN + at)))
-            finished = vand(drawn, vgt(splat16(_T_MIN), left))
+            finished = vand(vge(passing, splat16(_T_MIN)), vgt(splat16(_T_MIN), left))
             if vany(finished):
                 number = splat16(_F(entry - start + 1))
                 vstore(work, LAST + at, vselect(finished, number, vload(work, LAST + at)))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -45,7 +47,7 @@ class Buffers:
         """An uninitialised C-contiguous array of this shape; valid until the next call. Raises
         MemoryError before it allocates more than is free: a system that promises more memory than
         it has would end the process later."""
-        size = int(np.prod(shape))
+        size = math.prod(shape)
         have = self._arrays.get(name)
         if have is None or have.size < size or have.dtype != np.dtype(dtype):
             wanted, free = size * np.dtype(dtype).itemsize, available_mib() * MIB
@@ -60,12 +62,12 @@ class Buffers:
     ) -> list[NDArray[Any]]:
         """Uninitialised arrays of (shape, dtype) from one buffer that all calls with its name
         share: each call invalidates the arrays of the one before."""
-        sizes = [int(np.prod(shape)) * np.dtype(dtype).itemsize for shape, dtype in wanted]
-        ends = np.cumsum([-(-size // 64) * 64 for size in sizes])
-        arena = self.get(name, (int(ends[-1]),), np.uint8)
+        sizes = [math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in wanted]
+        ends = [*accumulate(-(-size // 64) * 64 for size in sizes)]
+        arena = self.get(name, (ends[-1],), np.uint8)
         parts = []
         for (shape, dtype), size, end in zip(wanted, sizes, ends, strict=True):
-            start = int(end) + -(-size // 64) * -64
+            start = end + -(-size // 64) * -64
             parts.append(arena[start : start + size].view(dtype).reshape(shape))
         return parts
 

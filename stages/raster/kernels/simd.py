@@ -98,8 +98,7 @@ def prefetch(typingctx: Any, array: Any, index: Any) -> Any:
 
 
 def _any(builder: Any, mask: Any) -> Any:
-    bits = builder.bitcast(mask, ir.IntType(LANES))
-    return builder.icmp_unsigned("!=", bits, ir.Constant(ir.IntType(LANES), 0))
+    return call_llvm(builder, f"llvm.vector.reduce.or.v{LANES}i1", ir.IntType(1), [mask])
 
 
 def _sum(builder: Any, vector: Any) -> Any:
