@@ -16,14 +16,16 @@ from pathlib import Path
 
 import psutil
 
+from stages.base import cgroups
+
 MIB = 1024.0 * 1024.0
 _TRAINING_BYTES = 1600  # a splat
 _SELF = Path("/proc/self")
 
 
 def available_mib() -> float:
-    """Memory that can be allocated without swapping, MiB."""
-    return float(psutil.virtual_memory().available) / MIB
+    """Memory that can be allocated without swapping, within a container's limit, MiB."""
+    return min(float(psutil.virtual_memory().available), cgroups.free_bytes()) / MIB
 
 
 def training_mib(splats: int) -> float:

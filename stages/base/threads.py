@@ -8,7 +8,10 @@ then takes ten times as long. The matrices here are small: OpenBLAS takes 60 tim
 
 from __future__ import annotations
 
+import math
 import os
+
+from stages.base import cgroups
 
 
 def configure() -> None:
@@ -18,11 +21,14 @@ def configure() -> None:
 
 
 def count() -> int:
-    """Number of threads: SPLAT_THREADS if set, else the cores that this process may run on."""
+    """Number of threads: SPLAT_THREADS if set, else the cores that this process may run on, within
+    a container's limit."""
     wanted = os.environ.get("SPLAT_THREADS", "")
     if wanted.isdigit() and int(wanted) > 0:
         return int(wanted)
     try:
-        return len(os.sched_getaffinity(0))
+        cores = len(os.sched_getaffinity(0))
     except AttributeError:  # macOS, Windows
         return os.cpu_count() or 1
+    limit = cgroups.processors()
+    return cores if limit >= cores else max(1, math.ceil(limit))
