@@ -23,6 +23,7 @@ from stages.raster.cpu.projection import (
 )
 from stages.raster.definition import ALPHA_MIN, Arrays
 from stages.raster.kernels.simd import kernel, prefetch, take_ticket
+from stages.raster.kernels.simd32 import least8, most8, span_bits
 from stages.raster.kernels.simd64 import (
     dceil,
     dfloor,
@@ -37,6 +38,7 @@ from stages.raster.kernels.simd64 import (
 
 TILE = 16  # pixels across and down
 BLOCK = 4  # a tile is 4x4 blocks of 4x4 pixels
+_ALL_BLOCKS = 0xFFFF  # mask of a tile's blocks
 CHUNKS = 16  # fixed, so that the lists do not depend on the number of threads
 # Columns of `places`, one row for each visible splat: its row in the input, the position and number
 # of its tiles, and the slot of its first gradient.
@@ -191,34 +193,27 @@ def _block_spans(geometry, row, width, y0, y1, reach2, top, spans, at):
 
 
 @kernel
-def _mask(spans, q0, tile_x):
-    """Mask of the blocks of tile column tile_x that the four block rows from spans[q0] on touch."""
-    mask = 0
-    for q in range(4):
-        low = min(max(spans[q0 + q] - 4 * tile_x, 0), 4)
-        end = max(min(spans[q0 + q + 8] - 4 * tile_x + 1, 4), low)
-        mask |= ((1 << end) - (1 << low)) << (4 * q)
-    return mask
+def _emit_tile_rows(spans, q0, first_tile, tiles_x, at, columns, tiles, masks):
+    """Write the tiles of two tile rows from position `at` on; returns the position after them.
 
-
-@kernel
-def _emit_tile_row(spans, q0, tile_row, at, tiles, masks):
-    """Write the tiles of one tile row from position `at` on; returns the position after them.
-
-    The tile row's block rows are the four from spans[q0] on. tile_row: number of its first tile.
-    Two tiles are written without a branch; the position does not advance if they are not touched.
+    Their block rows are the eight from spans[q0] on. first_tile: number of the upper row's first
+    tile. columns: scratch, [tiles_x + 2]. Two tiles of a row are written without a branch; the
+    position does not advance if they are not touched.
     """
-    least = min(min(spans[q0], spans[q0 + 1]), min(spans[q0 + 2], spans[q0 + 3]))
-    most = max(max(spans[q0 + 8], spans[q0 + 9]), max(spans[q0 + 10], spans[q0 + 11]))
-    first = least // 4
-    for tile_x in (first, first + 1):
-        mask = _mask(spans, q0, tile_x)
-        tiles[at], masks[at] = tile_row + tile_x, mask
-        at += mask != 0
-    for tile_x in range(first + 2, most // 4 + 1):
-        mask = _mask(spans, q0, tile_x)
-        tiles[at], masks[at] = tile_row + tile_x, mask
-        at += mask != 0
+    first = least8(spans, q0) // 4
+    count = max(most8(spans, q0 + 8) // 4 - first + 1, 2)
+    for k in range(count):
+        columns[k] = span_bits(spans, q0, 4 * (first + k))
+    for row in range(2):
+        tile, shift = first_tile + row * tiles_x + first, 16 * row
+        for k in (0, 1):
+            mask = (columns[k] >> shift) & _ALL_BLOCKS
+            tiles[at], masks[at] = tile + k, mask
+            at += mask != 0
+        for k in range(2, count):
+            mask = (columns[k] >> shift) & _ALL_BLOCKS
+            tiles[at], masks[at] = tile + k, mask
+            at += mask != 0
     return at
 
 
@@ -255,7 +250,8 @@ def find_tiles(ticket, visible, geometry, width, height, places, tiles, masks):
     """
     tiles_x = (width + TILE - 1) // TILE
     most = BATCH * ((height + TILE - 1) // TILE // 2 + 1)
-    groups, spans = np.empty((most, 2), np.int64), np.empty(16 * most, np.int64)
+    groups, spans = np.empty((most, 2), np.int64), np.empty(16 * most, np.int32)
+    columns = np.empty(tiles_x + 2, np.int64)
     n = len(visible)
     size = (n + CHUNKS - 1) // CHUNKS
     while True:
@@ -272,8 +268,8 @@ def find_tiles(ticket, visible, geometry, width, height, places, tiles, masks):
                 place, tile_y = groups[group, 0], groups[group, 1]
                 start = np.int64(places[place, FOUND])
                 at = start + places[place, COUNT]
-                at = _emit_tile_row(spans, 16 * group, tile_y * tiles_x, at, tiles, masks)
-                at = _emit_tile_row(spans, 16 * group + 4, (tile_y + 1) * tiles_x, at, tiles, masks)
+                upper = tile_y * tiles_x
+                at = _emit_tile_rows(spans, 16 * group, upper, tiles_x, at, columns, tiles, masks)
                 places[place, COUNT] = at - start
 
 

@@ -1,7 +1,7 @@
 """Support for compiled kernels: vector types, threads, and the cache of compiled code.
 
-`pool` runs kernels in threads, `cache` keeps compiled ones, `simd` and `simd64` are the vectors
-that they compute with, which `vectors` defines.
+`pool` runs kernels in threads, `cache` keeps compiled ones, `simd`, `simd32` and `simd64` are the
+vectors that they compute with, which `vectors` defines.
 """
 
 from stages.raster.kernels import cache

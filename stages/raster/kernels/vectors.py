@@ -143,13 +143,14 @@ class Lanes:
 
     def storer(self, step: int = 1) -> Any:
         """An intrinsic (array, index, value), the inverse of `loader`: into an array of the lanes'
-        type, or rounded to zero into one of integers as wide."""
+        type, or rounded to zero into one of integers."""
 
         def typed(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
             def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
                 address, stored = self._place(context, builder, sig, args, step)
-                whole = isinstance(stored, types.Integer)
-                value = builder.fptosi(args[2], self.integers) if whole else args[2]
+                value = args[2]
+                if isinstance(stored, types.Integer):
+                    value = builder.fptosi(value, address.type.pointee)
                 builder.store(value, address, align=stored.bitwidth // 8)
                 return context.get_dummy_value()
 
