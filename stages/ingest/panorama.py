@@ -59,7 +59,8 @@ def panorama(pixels: NDArray[np.uint8], stored: tuple[int, int], projection: str
         if projection == EQUIRECTANGULAR and abs(width / (2 * height) - 1) <= _RATIO:
             return SPHERE
         return f"a panorama ({projection}, {width} x {height}, as its metadata say)"
-    if max(stored) != 2 * min(stored) or pixels.shape[1] < _FEWEST:
+    height, width = pixels.shape[:2]
+    if max(stored) != 2 * min(stored) or width <= height or width < _FEWEST:
         return ""
     small = _reduced(pixels)
     if _two_fisheyes(small):

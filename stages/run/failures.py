@@ -62,7 +62,7 @@ def unusable(error: OSError, run_folder: Path) -> SplatError:
         "run-folder-unusable",
         given=f"{error.filename or run_folder}: {error.strerror or error}.",
         wanted="A run folder that can be made and written to.",
-        hint="Check the path, or use another folder: `splat process --out FOLDER`.",
+        hint="Check the path, or name another folder with --out.",
     )
 
 

@@ -61,5 +61,5 @@ def _busy(folder: Path) -> SplatError:
         "run-folder-busy",
         given=f"{folder} is in use by {who}.",
         wanted="One process at a time in a run folder.",
-        hint="Wait for it, stop it, or use another folder: `splat process --out FOLDER`.",
+        hint="Wait for it, stop it, or name another folder with --out.",
     )

@@ -34,6 +34,7 @@ class SfmSettings:
         False,
         "Use the best reconstruction found even if it fails the quality gates.",
         panel="Advanced",
+        midway=True,
     )
     cameras: Path | None = setting(
         None,
@@ -66,6 +67,7 @@ class SfmSettings:
         "Two photographs and the distance between their cameras (metres).",
         panel="Units",
         together="A B METRES",
+        midway=True,
     )
     marker: float = setting(
         0.0,
@@ -74,6 +76,7 @@ class SfmSettings:
         panel="Units",
         min=0.0,
         max=1000.0,
+        midway=True,
     )
     crs: str = setting(
         "",
@@ -82,6 +85,7 @@ class SfmSettings:
         panel="Units",
         pattern=r"(EPSG:[0-9]{4,6})?",
         wanted="An EPSG code, such as EPSG:25832.",
+        midway=True,
     )
     max_minutes: float = setting(
         120.0,

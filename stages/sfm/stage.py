@@ -17,6 +17,7 @@ from typing import Any
 
 from stages.base.atomic import replacing
 from stages.base.errors import ReconstructionError
+from stages.base.settings import settings_of
 from stages.base.stage import Report
 from stages.base.text import counted, listed
 from stages.scene import Capture, Reconstruction
@@ -59,8 +60,9 @@ def run(
         projected_system(settings.crs)
     if settings.scale:
         metric_scale.check_distance(settings.scale, capture.photos)  # before hours of work
-    if (folder / _FINISHED).exists():
+    if _is_finished(folder, settings):
         return _load_finished(folder, report)
+    (folder / _FINISHED).unlink(missing_ok=True)  # by settings that have changed since
     if settings.cameras is not None:
         found, seconds = _from_known_cameras(capture, settings, settings.cameras, folder, report)
     else:
@@ -70,7 +72,7 @@ def run(
     report.metric("levelled", found.levelled)
     report.metric("units", found.units)
     report.metric("origin", [float(value) for value in found.origin])
-    _write_finished(folder, report)
+    _write_finished(folder, settings, report)
     for step, duration in seconds.items():  # not in sfm.json: durations differ between runs
         report.metric(f"{step}_seconds", round(duration, 1))
     shutil.rmtree(folder / _WORK)
@@ -183,10 +185,30 @@ def _report_model(
     report.metric("mean_reprojection_error_px", round(mean_error_px, 4))
 
 
-def _write_finished(folder: Path, report: Report) -> None:
-    data = {"metrics": report.metrics, "warnings": report.warnings}
+def _midway(settings: SfmSettings) -> dict[str, Any]:
+    """The settings that may change on resuming, as JSON holds them."""
+    names = [one.name for one in settings_of(SfmSettings) if one.midway]
+    data: dict[str, Any] = {name: getattr(settings, name) for name in names}
+    return {k: list(v) if isinstance(v, tuple) else v for k, v in data.items()}
+
+
+def _write_finished(folder: Path, settings: SfmSettings, report: Report) -> None:
+    data = {
+        "settings": _midway(settings),
+        "metrics": report.metrics,
+        "warnings": report.warnings,
+    }
     with replacing(folder / _FINISHED) as path:
         path.write_text(json.dumps(data, indent=1, ensure_ascii=False), encoding="utf-8")
+
+
+def _is_finished(folder: Path, settings: SfmSettings) -> bool:
+    """Whether a run with these settings was killed after its last step."""
+    try:
+        data = json.loads((folder / _FINISHED).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return False
+    return bool(data.get("settings") == _midway(settings))
 
 
 def _load_finished(folder: Path, report: Report) -> Reconstruction:

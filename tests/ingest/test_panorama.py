@@ -60,6 +60,17 @@ def test_ordinary_photographs_twice_as_wide_as_high_are_none() -> None:
         assert panorama(pixels, size(pixels), "") == "", path.name
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_upright_pictures_are_none_however_their_edges_look(seed: int) -> None:
+    """A phone's of an object before a wall that gets brighter upwards."""
+    rng = np.random.default_rng(seed)
+    wall = np.linspace(200, 90, 1024)[:, None, None] + rng.normal(0, 1, (1024, 512, 3))
+    wall[300:700, 100:400] = rng.integers(0, 256, (20, 15, 3)).repeat(20, 0).repeat(20, 1)
+    upright = np.clip(wall, 0, 255).astype(np.uint8)
+    assert panorama(upright, size(upright), "") == ""
+    assert panorama(upright, (1024, 512), "") == ""  # turned by EXIF
+
+
 def test_a_wall_without_contrast_is_none() -> None:
     pixels = np.full((256, 512, 3), 180, np.uint8)
     assert panorama(pixels, size(pixels), "") == ""

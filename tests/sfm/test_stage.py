@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,10 +19,11 @@ from numpy.typing import NDArray
 
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report
+from stages.run.request import Request, settings_to_data
 from stages.scene import Capture, Reconstruction
 from stages.sfm import stage as sfm
 from stages.sfm.checks import fallbacks
-from stages.sfm.settings import SfmSettings
+from stages.sfm.settings import STAGE, SfmSettings
 from tests import processes
 from tests.sfm import room_captures
 from tests.sfm.checks import bad_captures
@@ -313,6 +316,30 @@ def test_two_scenes_are_separated_and_one_may_be_used(
     codes = [code for code, _ in report.warnings]
     assert "sfm-photographs-left-out" in codes
     assert "sfm-separate-groups" in codes
+
+
+def test_what_says_how_large_the_scene_is_may_change_on_resuming() -> None:
+    """Photographs are matched without it; hours of work go on."""
+
+    def key(settings: SfmSettings) -> dict[str, Any]:
+        return Request(STAGE, settings_to_data(settings), {}, {}).key()
+
+    placed = SfmSettings(marker=0.05, crs="EPSG:25832", allow_partial=True)
+    assert key(placed) == key(SfmSettings(scale=("a.jpg", "b.jpg", "1"))) == key(SfmSettings())
+    assert key(SfmSettings(features="sift")) != key(SfmSettings())
+
+
+def test_a_run_killed_after_its_end_is_not_taken_for_one_of_another_scale(
+    small: tuple[Reconstruction, Report, Path], tmp_path: Path
+) -> None:
+    found, _, folder = small
+    again = tmp_path / "again"
+    shutil.copytree(folder, again)
+    first, last = found.views[0].name, found.views[-1].name
+    report = Report()
+    known = replace(FEW, scale=(first, last, "3"))
+    sfm.run({"ingest": bad_captures.sample(9)}, known, again, report)
+    assert report.metrics["scale_source"] == f"{first} and {last} are 3 m apart"
 
 
 def test_two_photographs_are_too_few(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.errors import ReconstructionError, SplatError, UsageError
+from stages.base.errors import Family, ReconstructionError, SplatError, UsageError
 from stages.base.stage import Report
 from stages.cameras.camera_file import NO_GEOREFERENCE, Georeference
 from stages.scene import Camera, Photo
@@ -75,7 +75,7 @@ def find_metric_scale(
             report.warn(
                 "sfm-marker-unused",
                 f"--marker {known.marker:g} is not used: the distance of --scale says how large "
-                "the scene is. Give only one of them; a run folder keeps both, so start another.",
+                "the scene is. Give only one of them: --marker 0 takes it back.",
             )
     elif known.marker:
         metric = _from_markers(known.marker, marker_sides(pictures, cameras), report)
@@ -163,7 +163,8 @@ def _no_marker(why: str) -> SplatError:
         given=f"--marker cannot be used: {why}.",
         wanted="Printed ArUco markers of one size, flat, sharp, with their white margin; alone or "
         "on a ChArUco board.",
-        hint="Leave --marker away, or give a distance with --scale instead.",
+        hint="Leave --marker away (--marker 0 takes it back), or give a distance with --scale.",
+        family=Family.INPUT,
     )
 
 

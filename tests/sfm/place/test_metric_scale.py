@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stages.base.errors import SplatError
+from stages.base.errors import Family, SplatError
 from stages.base.stage import Report
 from stages.ingest.exif import read_exif
 from stages.scene import Camera, Capture, Photo, look_at
@@ -78,6 +78,15 @@ def test_a_marker_beside_a_distance_is_said_to_be_unused() -> None:
     assert metric is not None
     assert "3.5 m apart" in metric.source
     assert [code for code, _ in report.warnings] == ["sfm-marker-unused"]
+
+
+def test_markers_that_are_not_found_are_an_error_of_the_photographs() -> None:
+    """So the run forgets `--marker`, and the next command goes on without it."""
+    posed = [Camera(640, 480, 600.0, 600.0, 320.0, 240.0, pose) for pose in cameras()]
+    photos = capture_of([None] * 12).photos
+    with pytest.raises(SplatError) as raised:
+        find_metric_scale(KnownScale(marker=0.05), photos, posed, [], True, Report())
+    assert (raised.value.code, raised.value.family) == ("sfm-marker", Family.INPUT)
 
 
 def test_points_move_with_the_cameras() -> None:
