@@ -50,6 +50,8 @@ TEXTS = {  # by code, in the order of the warnings; {names} of files or photogra
     "{names}.",
     "ingest-depth-unused": "Depth maps that belong to no photograph by their names are not used: "
     "{names}.",
+    "ingest-depth-beside": "Depth maps beside their photographs are not used: {names}. Give the "
+    "photographs' folder as --depth to use them, too.",
     "ingest-blurred": "Blurred, compared with the others: {names}. "
     "Take these again or remove them; more light or a shorter exposure helps.",
     "ingest-small": f"Smaller than {SMALL_BELOW_PX} pixels: {{names}}. "
@@ -66,6 +68,7 @@ def unused_files(files: Findings) -> dict[str, Sequence[str]]:
         "ingest-beside-frames": files.beside_frames,
         "ingest-mask-unused": files.stray_masks,
         "ingest-depth-unused": files.stray_depths,
+        "ingest-depth-beside": files.unused_depths,
     }
 
 

@@ -73,6 +73,7 @@ class Findings:
         stray_masks: mask files that belong to no photograph.
         depths: depth maps by the name of their photograph.
         stray_depths: depth maps that belong to no photograph.
+        unused_depths: depth maps beside their photographs, whose folder was not named for them.
     """
 
     sources: tuple[Source, ...]
@@ -85,6 +86,7 @@ class Findings:
     stray_masks: tuple[str, ...] = ()
     depths: Mapping[str, DepthFile] = field(default_factory=dict)
     stray_depths: tuple[str, ...] = ()
+    unused_depths: tuple[str, ...] = ()
     beside_frames: tuple[str, ...] = ()
 
 
