@@ -46,6 +46,9 @@ TEXTS = {  # by code, in the order of the warnings; {names} of files or photogra
     "ingest-mask-unused": "Masks that belong to no photograph by their names are not used: "
     "{names}.",
     "ingest-mask-missing": "Some photographs have no mask: {names}. There everything counts.",
+    "ingest-mask-turn-unknown": "The Exif orientation turns these photographs, and the sizes of "
+    "masks or depth maps do not tell whether these are turned too: {names}. They are taken as "
+    "upright. Check them, and turn those that lie as the stored pixels do.",
     "ingest-rig-mask-unused": "The capture has no 360-degree pictures, so this mask is not used: "
     "{names}.",
     "ingest-depth-unused": "Depth maps that belong to no photograph by their names are not used: "

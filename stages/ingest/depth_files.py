@@ -178,10 +178,10 @@ def check_paired(files: Findings, chosen: Path | None) -> None:
         )
 
 
-def read_depth(file: DepthFile, decoded: Decoded) -> NDArray[np.float32]:
+def read_depth(file: DepthFile, decoded: Decoded, as_stored: bool = False) -> NDArray[np.float32]:
     """[h, w] metres, 0 where nothing was measured; upright, its longer side at most MAX_SIDE.
 
-    decoded: the photograph. Raises Unusable.
+    decoded: the photograph. as_stored: see `turned_with`. Raises Unusable.
     """
     if file.others:
         names = ", ".join(path.name for path in (file.path, *file.others))
@@ -210,17 +210,31 @@ def read_depth(file: DepthFile, decoded: Decoded) -> NDArray[np.float32]:
         metres = np.where(sure >= highest, metres, np.float32(0))
     if not metres.any():
         raise Unusable(f"{file.path.name} holds no confident measurement", _EXPORT)
-    metres = _upright(metres, decoded, file.path.name)
+    metres = _upright(metres, decoded, as_stored, file.path.name)
     size = fitted_size(metres.shape[1], metres.shape[0], MAX_SIDE)
     return np.asarray(cv2.resize(metres, size, interpolation=cv2.INTER_NEAREST_EXACT))
 
 
-def _upright(metres: NDArray[np.float32], decoded: Decoded, name: str) -> NDArray[np.float32]:
+def _upright(
+    metres: NDArray[np.float32], decoded: Decoded, as_stored: bool, name: str
+) -> NDArray[np.float32]:
     """Turned with the photograph, see `turned_with`. Raises Unusable."""
-    turned, sizes = turned_with(Image.fromarray(metres), decoded)
+    turned, sizes = turned_with(Image.fromarray(metres), decoded, as_stored)
     if sizes:
         raise Unusable(f"{name} is {sizes}", "Use a map with its photograph's proportions")
     return np.asarray(turned)
+
+
+def size_of(path: Path) -> tuple[int, int] | None:
+    """(width, height) of a map; None if it cannot be read."""
+    try:
+        if path.suffix.lower() in (".npy", ".exr"):
+            height, width = _values(path).shape[:2]
+            return width, height
+        with Image.open(path, formats=("PNG", "TIFF")) as image:
+            return image.size
+    except Exception:  # decoders raise whatever the damage leads to
+        return None
 
 
 def _values(path: Path) -> NDArray[Any]:
