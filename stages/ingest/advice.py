@@ -46,10 +46,15 @@ TEXTS = {  # by code, in the order of the warnings; {names} of files or photogra
     "ingest-mask-unused": "Masks that belong to no photograph by their names are not used: "
     "{names}.",
     "ingest-mask-missing": "Some photographs have no mask: {names}. There everything counts.",
+    "ingest-mask-turn-unknown": "The Exif orientation turns these photographs, and the sizes of "
+    "masks or depth maps do not tell whether these are turned too: {names}. They are taken as "
+    "upright. Check them, and turn those that lie as the stored pixels do.",
     "ingest-rig-mask-unused": "The capture has no 360-degree pictures, so this mask is not used: "
     "{names}.",
     "ingest-depth-unused": "Depth maps that belong to no photograph by their names are not used: "
     "{names}.",
+    "ingest-depth-beside": "Depth maps beside their photographs are not used: {names}. Give the "
+    "photographs' folder as --depth to use them, too.",
     "ingest-blurred": "Blurred, compared with the others: {names}. "
     "Take these again or remove them; more light or a shorter exposure helps.",
     "ingest-small": f"Smaller than {SMALL_BELOW_PX} pixels: {{names}}. "
@@ -66,6 +71,7 @@ def unused_files(files: Findings) -> dict[str, Sequence[str]]:
         "ingest-beside-frames": files.beside_frames,
         "ingest-mask-unused": files.stray_masks,
         "ingest-depth-unused": files.stray_depths,
+        "ingest-depth-beside": files.unused_depths,
     }
 
 

@@ -149,6 +149,22 @@ def decode(path: Path, max_side: int, budget: PixelBudget) -> Decoded:
         raise Unusable(f"it does not decode ({reason_of(error)})") from error
 
 
+def head(path: Path) -> tuple[tuple[int, int], int]:
+    """(width, height) as stored and EXIF orientation of the photograph at `path`, as in `Decoded`,
+    without its pixels. Raises Unusable."""
+    try:
+        with Image.open(path, formats=[name for name in FORMATS if name in Image.OPEN]) as image:
+            return image.size, _exif_of(image).orientation
+    except Exception as error:  # decoders raise whatever the damage leads to
+        raise Unusable(f"it does not decode ({reason_of(error)})") from error
+
+
+def _exif_of(image: Image.Image) -> Exif:
+    exif = read_exif(image)
+    turned = image.format in ("HEIF", "TIFF")  # the decoder turns the pixels itself
+    return replace(exif, orientation=1) if turned else exif
+
+
 def _read(path: Path) -> bytes:
     try:
         if path.stat().st_size > MAX_FILE_BYTES:
@@ -176,13 +192,11 @@ def check_size(size: tuple[int, int]) -> tuple[int, int]:
 
 
 def _decode(image: Image.Image, data: bytes, max_side: int) -> Decoded:
-    stored, exif, info = image.size, read_exif(image), dict(image.info)
+    stored, exif, info = image.size, _exif_of(image), dict(image.info)
     size = fitted_size(*stored, max_side)
     jpeg = image.format in ("JPEG", "MPO")
     if jpeg and size != stored and image.mode in ("RGB", "L"):
         image.draft(None, (2 * size[0], 2 * size[1]))  # lets the decoder average for us
-    if image.format in ("HEIF", "TIFF"):
-        exif = replace(exif, orientation=1)  # the decoder turns the pixels itself
     native_mode = image.mode
     basic = _resized(_basic_mode(_loaded(image, data)), size, stored)
     black, alpha = _over_black(basic)

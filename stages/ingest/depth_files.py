@@ -24,15 +24,23 @@ from PIL import Image
 from stages.base.errors import SplatError
 from stages.cameras import nerfstudio
 from stages.cameras.nerfstudio import MILLIMETRE
-from stages.ingest.decode import Decoded, Unusable, check_size
+from stages.ingest.decode import Decoded, Unusable, check_size, readers_set_up
 from stages.ingest.masking import turned_with
-from stages.ingest.masks import of_video, pair_masks
-from stages.ingest.sources import DepthFile, Findings, folder_beside, suffix_of
+from stages.ingest.masks import masks_beside, names_for, of_video, pair_masks
+from stages.ingest.sources import (
+    PICTURES,
+    DepthFile,
+    Findings,
+    folder_beside,
+    stem_of,
+    suffix_of,
+)
 from stages.scene import fitted_size
 
 FOLDERS = ("depth", "depths")  # beside the photographs' folder, or in it
 CONFIDENCE = "confidence"  # a folder beside that of the maps
 SUFFIXES = frozenset({".png", ".tif", ".tiff", ".exr", ".npy"})
+_ENDING = "_depth"  # of the names of maps
 LARGEST = 0xFFFF  # what depth sensors write where they measured nothing, if not 0
 MAX_SIDE = 320  # of a map that is kept, pixels: seeds are no denser
 _MOST_BYTES = 1 << 30
@@ -82,7 +90,7 @@ def pair_depths(
     left = {_of_frame(name): path for name, path in maps.items()}
     maps_of: dict[str, DepthFile] = {}
     names = list(photographs)
-    while more := pair_masks(names, left, "_depth"):
+    while more := pair_masks(names, left, _ENDING):
         for name, path in more.items():
             first = maps_of.get(name, DepthFile(path, unit))
             others = (*first.others, path) if name in maps_of else ()
@@ -90,6 +98,40 @@ def pair_depths(
         used = set(more.values())
         left = {name: path for name, path in left.items() if path not in used}
     return maps_of
+
+
+def maps_beside(files: Mapping[str, Path], chosen: bool) -> set[str]:
+    """Names of the depth maps beside their photographs: a_depth.png beside a.jpg.
+
+    Args:
+        files: of the photographs' folder, by name.
+        chosen: whether the user says that maps are there. Then the other names of maps count, too
+            (a.jpg.png, a.png, a.npy), unless the file is a picture of 8 bits or in colour, such as
+            a mask. Otherwise such a picture is a photograph even if it is called a_depth.png.
+    """
+    pictures = [name for name in files if suffix_of(name) in PICTURES]
+    found = {
+        name
+        for name in masks_beside(pictures, _ENDING)
+        if suffix_of(name) in SUFFIXES and stem_of(name).endswith(_ENDING)
+    }
+    if not chosen:
+        return {name for name in found if _measures(files[name])}
+    left = [name for name in pictures if name not in found]
+    measured = {name for name in left if suffix_of(name) in SUFFIXES and _measures(files[name])}
+    photographs = {name for name in left if name not in measured} or set(left)
+    stems = {key.casefold() for name in photographs for key in names_for(name, _ENDING)}
+    others = (n for n in files if suffix_of(n) in SUFFIXES and n not in photographs)
+    return found | {name for name in others if stem_of(name) in stems}
+
+
+def _measures(path: Path) -> bool:
+    """Whether a PNG or a TIFF is grey, of more than 8 bits. Only its head is read."""
+    try:
+        with readers_set_up(), Image.open(path, formats=("PNG", "TIFF")) as image:
+            return image.mode[0] in "IF"
+    except Exception:  # decoders raise whatever the damage leads to
+        return False
 
 
 def needs_no_photograph(name: str, files: Container[str]) -> bool:
@@ -136,10 +178,10 @@ def check_paired(files: Findings, chosen: Path | None) -> None:
         )
 
 
-def read_depth(file: DepthFile, decoded: Decoded) -> NDArray[np.float32]:
+def read_depth(file: DepthFile, decoded: Decoded, as_stored: bool = False) -> NDArray[np.float32]:
     """[h, w] metres, 0 where nothing was measured; upright, its longer side at most MAX_SIDE.
 
-    decoded: the photograph. Raises Unusable.
+    decoded: the photograph. as_stored: see `turned_with`. Raises Unusable.
     """
     if file.others:
         names = ", ".join(path.name for path in (file.path, *file.others))
@@ -168,17 +210,31 @@ def read_depth(file: DepthFile, decoded: Decoded) -> NDArray[np.float32]:
         metres = np.where(sure >= highest, metres, np.float32(0))
     if not metres.any():
         raise Unusable(f"{file.path.name} holds no confident measurement", _EXPORT)
-    metres = _upright(metres, decoded, file.path.name)
+    metres = _upright(metres, decoded, as_stored, file.path.name)
     size = fitted_size(metres.shape[1], metres.shape[0], MAX_SIDE)
     return np.asarray(cv2.resize(metres, size, interpolation=cv2.INTER_NEAREST_EXACT))
 
 
-def _upright(metres: NDArray[np.float32], decoded: Decoded, name: str) -> NDArray[np.float32]:
+def _upright(
+    metres: NDArray[np.float32], decoded: Decoded, as_stored: bool, name: str
+) -> NDArray[np.float32]:
     """Turned with the photograph, see `turned_with`. Raises Unusable."""
-    turned, sizes = turned_with(Image.fromarray(metres), decoded)
+    turned, sizes = turned_with(Image.fromarray(metres), decoded, as_stored)
     if sizes:
         raise Unusable(f"{name} is {sizes}", "Use a map with its photograph's proportions")
     return np.asarray(turned)
+
+
+def size_of(path: Path) -> tuple[int, int] | None:
+    """(width, height) of a map; None if it cannot be read."""
+    try:
+        if path.suffix.lower() in (".npy", ".exr"):
+            height, width = _values(path).shape[:2]
+            return width, height
+        with Image.open(path, formats=("PNG", "TIFF")) as image:
+            return image.size
+    except Exception:  # decoders raise whatever the damage leads to
+        return None
 
 
 def _values(path: Path) -> NDArray[Any]:

@@ -51,7 +51,7 @@ def find(folder: Path, more_masks: Path | None = None, depth: Path | None = None
         return Findings((), (Source(folder, name, f"{PHOTOS_FOLDER}{name}"),), (), (), 0)
     _check_folder(folder)
     files = _files_by_name(folder)
-    depths, stray_depths = _remove_depths(files, folder, depth)
+    depths, stray_depths, unused_depths = _remove_depths(files, folder, depth)
     mask_of, stray = _remove_masks(files, folder, more_masks)
     names = sorted(files, key=natural_key)
     pictures = [name for name in names if suffix_of(name) in PICTURES]
@@ -77,6 +77,7 @@ def find(folder: Path, more_masks: Path | None = None, depth: Path | None = None
         stray_masks=stray,
         depths=depths,
         stray_depths=stray_depths,
+        unused_depths=unused_depths,
         beside_frames=beside_frames,
     )
     if not findings.sources and not findings.videos:
@@ -151,16 +152,18 @@ def _name_in(folder: Path, path: Path) -> str:
 
 def _remove_depths(
     files: dict[str, Path], folder: Path, source: Path | None
-) -> tuple[dict[str, DepthFile], tuple[str, ...]]:
+) -> tuple[dict[str, DepthFile], tuple[str, ...], tuple[str, ...]]:
     """Remove maps of depth and of confidence from `files`, if any map belongs to a photograph. Maps
-    are in a folder called depth, beside photographs, and in `source`. Returns maps by the
-    photograph's name, and stray ones."""
+    are in a folder called depth, beside frames of 3D Scanner App, and in `source`, which may be the
+    photographs' folder. Returns maps by the photograph's name, stray ones, and maps beside their
+    photographs that `source` does not name, which are removed too."""
     maps: dict[str, Path] = {}
+    among = source is not None and source.resolve() == folder.resolve()
     unit = 0.0
     if source is not None and source.is_file():
         named, unit = nerfstudio.depth_maps(source)
         maps = {_name_in(folder, source.parent / name) or name: at for name, at in named.items()}
-    elif source is not None and source.is_dir() and source.resolve() != folder.resolve():
+    elif source is not None and source.is_dir() and not among:
         every = _files_by_name(source).items()
         maps = {name: path for name, path in every if suffix_of(name) in depth_files.SUFFIXES}
     apart = {path.resolve() for path in maps.values()}
@@ -170,10 +173,17 @@ def _remove_depths(
         if files[name].resolve() not in apart:
             short = name.partition("/")[2] if name.casefold().startswith("depth") else name
             maps[short or name] = files[name]
+    beside = depth_files.maps_beside({n: at for n, at in files.items() if n not in inside}, among)
+    if among:
+        maps |= {name: files[name] for name in beside}
+        inside |= beside
+    unused = () if among else tuple(sorted(beside, key=natural_key))
+    for name in unused:
+        del files[name]
     pictures = [name for name in files if suffix_of(name) in PICTURES and name not in inside]
     paired = depth_files.pair_depths(pictures, maps, unit)
     if not paired:
-        return {}, ()
+        return {}, (), unused
     for name in [name for name in files if name in inside or depth_files.is_confidence(name)]:
         del files[name]
     used = {path for file in paired.values() for path in (file.path, *file.others)}
@@ -182,7 +192,7 @@ def _remove_depths(
         for name, path in maps.items()
         if path not in used and not depth_files.needs_no_photograph(name, files)
     )
-    return paired, tuple(sorted(stray, key=natural_key))
+    return paired, tuple(sorted(stray, key=natural_key)), unused
 
 
 def _files_by_name(folder: Path) -> dict[str, Path]:

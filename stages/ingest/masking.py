@@ -51,7 +51,13 @@ class MaskedPhoto:
 
     @classmethod
     def of(
-        cls, decoded: Decoded, name: str, file: Path | None, invert: bool, means: str
+        cls,
+        decoded: Decoded,
+        name: str,
+        file: Path | None,
+        invert: bool,
+        means: str,
+        as_stored: bool = False,
     ) -> MaskedPhoto:
         """Apply the photograph's alpha channel and a mask file.
 
@@ -62,6 +68,7 @@ class MaskedPhoto:
             invert: the mask is black inside.
             means: IGNORE, TRANSPARENT, or AUTO: outside a mask file is ignored, and outside alpha
                 alone is transparent.
+            as_stored: see `turned_with`.
 
         Raises:
             SplatError: "mask-unfit".
@@ -70,7 +77,7 @@ class MaskedPhoto:
             return cls(decoded)
         mask, scaled = decoded.alpha, False
         if file is not None:
-            kept, scaled = _read(file, name, invert, decoded)
+            kept, scaled = _read(file, name, invert, decoded, as_stored)
             solid = np.uint8(255) if mask is None else mask
             mask = np.where(kept, solid, np.uint8(0))
         assert mask is not None
@@ -155,10 +162,12 @@ def check_shares(photos: Sequence[Photo], shares: Sequence[float], files: bool) 
         )
 
 
-def _read(path: Path, name: str, invert: bool, decoded: Decoded) -> tuple[NDArray[np.bool_], bool]:
+def _read(
+    path: Path, name: str, invert: bool, decoded: Decoded, as_stored: bool = False
+) -> tuple[NDArray[np.bool_], bool]:
     """([H, W] what the mask keeps, whether it had another size than the photograph's file). Raises
     SplatError "mask-unfit"."""
-    image, sizes = turned_with(_opened(path, name), decoded)
+    image, sizes = turned_with(_opened(path, name), decoded, as_stored)
     if sizes:
         raise _unfit(path, name, f"it is {sizes}")
     kept = _bright(image) ^ invert
@@ -169,15 +178,28 @@ def _read(path: Path, name: str, invert: bool, decoded: Decoded) -> tuple[NDArra
     return np.asarray(resized > 0), image.size != decoded.upright
 
 
-def turned_with(image: Image.Image, decoded: Decoded) -> tuple[Image.Image, str]:
+def turned_with(
+    image: Image.Image, decoded: Decoded, as_stored: bool = False
+) -> tuple[Image.Image, str]:
     """(a mask or a depth map, turned upright with its photograph if it has the orientation of the
-    stored file; "", or both sizes in words if their proportions still differ)."""
-    upright, stored = decoded.upright, decoded.stored
-    if _same_aspect(image.size, upright):
+    stored file; "", or both sizes in words if their proportions still differ). as_stored: whether
+    it has that orientation if its proportions do not tell."""
+    upright, stored, orientation = decoded.upright, decoded.stored, decoded.exif.orientation
+    fits = same_aspect(image.size, stored)
+    if same_aspect(image.size, upright) and not (as_stored and fits):
         return image, ""
-    if upright != stored and _same_aspect(image.size, stored):
-        return image.transpose(UPRIGHT[decoded.exif.orientation]), ""
+    if fits:
+        return image.transpose(UPRIGHT[orientation]) if orientation != 1 else image, ""
     return image, f"{image.width} x {image.height}, the photograph {upright[0]} x {upright[1]}"
+
+
+def size_of(path: Path) -> tuple[int, int] | None:
+    """(width, height) of a mask; None if it cannot be read."""
+    try:
+        with Image.open(path, formats=[kind for kind in FORMATS if kind in Image.OPEN]) as image:
+            return image.size
+    except Exception:  # decoders raise whatever the damage leads to
+        return None
 
 
 def _opened(path: Path, name: str) -> Image.Image:
@@ -213,7 +235,7 @@ def _values(image: Image.Image) -> NDArray[np.float32]:
     return np.asarray(grey, np.float32)
 
 
-def _same_aspect(size: tuple[int, int], wanted: tuple[int, int]) -> bool:
+def same_aspect(size: tuple[int, int], wanted: tuple[int, int]) -> bool:
     """Whether both have the same aspect ratio, to a few hundredths."""
     return abs(size[0] * wanted[1] / (size[1] * wanted[0]) - 1.0) < MAX_ASPECT_DIFFERENCE
 

@@ -124,12 +124,12 @@ def pair_masks(
     return mask_of
 
 
-def masks_beside(photographs: Iterable[str]) -> dict[str, str]:
+def masks_beside(photographs: Iterable[str], ending: str = "_mask") -> dict[str, str]:
     """Files of a folder that are masks of others there (a.jpg.png or a_mask.png beside a.jpg): the
-    photograph's name by the mask's."""
+    photograph's name by the mask's. ending: see `names_for`."""
     photographs = list(photographs)
     photograph_of: dict[str, str] = {}
     for fold in (str.casefold, str):  # the second is closer
-        keys = {fold(key): name for name in photographs for key in names_for(name)[::2]}
+        keys = {fold(key): name for name in photographs for key in names_for(name, ending)[::2]}
         photograph_of |= {n: keys[fold(_stem(n))] for n in photographs if fold(_stem(n)) in keys}
     return photograph_of

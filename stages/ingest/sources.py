@@ -71,8 +71,11 @@ class Findings:
             their names.
         masks: mask files by the name of their photograph.
         stray_masks: mask files that belong to no photograph.
+        masks_as_stored, depths_as_stored: whether masks and depth maps whose proportions do not
+            tell have the orientation of the stored photographs, and not the upright one.
         depths: depth maps by the name of their photograph.
         stray_depths: depth maps that belong to no photograph.
+        unused_depths: depth maps beside their photographs, whose folder was not named for them.
     """
 
     sources: tuple[Source, ...]
@@ -83,8 +86,11 @@ class Findings:
     not_files: Mapping[str, str] = field(default_factory=dict)
     masks: Mapping[str, Path] = field(default_factory=dict)
     stray_masks: tuple[str, ...] = ()
+    masks_as_stored: bool = False
+    depths_as_stored: bool = False
     depths: Mapping[str, DepthFile] = field(default_factory=dict)
     stray_depths: tuple[str, ...] = ()
+    unused_depths: tuple[str, ...] = ()
     beside_frames: tuple[str, ...] = ()
 
 

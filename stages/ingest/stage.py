@@ -27,6 +27,7 @@ from stages.ingest.panorama import SPHERE, hint_for, panorama
 from stages.ingest.quality import Measures, measure, near_duplicates
 from stages.ingest.settings import IngestSettings
 from stages.ingest.sources import DepthFile, Findings, Source
+from stages.ingest.turns import with_turns
 from stages.ingest.write import write_depth, write_photo
 from stages.scene import TRANSPARENT, Capture, Photo
 
@@ -66,6 +67,7 @@ class _Picture:
         image: as in `Photo`.
         decoded: its pixels.
         mask: file of its mask.
+        mask_as_stored: see `Findings.masks_as_stored`.
         video: that it is a frame of; "" for a photograph.
         sphere: whether it shows the whole sphere.
     """
@@ -74,6 +76,7 @@ class _Picture:
     image: str
     decoded: Decoded
     mask: Path | None = None
+    mask_as_stored: bool = False
     video: str = ""
     sphere: bool = False
 
@@ -96,6 +99,7 @@ def run(
     found = find(root, apart, depth_files.depth_source(root, settings.depth))
     check_pairing(found, apart, settings.masks)
     depth_files.check_paired(found, settings.depth)
+    found, turn_unknown = with_turns(found)
     cut_out = _masks_cut_out(found, settings)
     if cut_out:
         settings = replace(settings, mask_means=TRANSPARENT)
@@ -116,7 +120,7 @@ def run(
     files = bool(found.masks or settings.rig_mask)
     masking.check_shares(pictures, [one.inside for one in usable], files)
     remarks = _remarks(usable, pictures, settings, cut_out) | advice.unused_files(found)
-    advice.about_names(remarks, report.warn)
+    advice.about_names(remarks | {"ingest-mask-turn-unknown": turn_unknown}, report.warn)
     duplicates = near_duplicates([one.measures.thumbnail for one in usable if one.measures])
     first = {usable[i].name: usable[group[0]].name for group in duplicates for i in group}
     photos = (photo for one in usable for photo in one.photos)
@@ -201,23 +205,34 @@ def _ingest_photograph(
         elif kind:
             raise Unusable(f"it is {kind}", hint_for(kind))
         mask = files.masks.get(source.name)
-        picture = _Picture(source.name, source.image, decoded, mask, sphere=kind == SPHERE)
+        picture = _Picture(
+            source.name,
+            source.image,
+            decoded,
+            mask,
+            mask_as_stored=files.masks_as_stored,
+            sphere=kind == SPHERE,
+        )
         done = _write(picture, settings, folder)
     except Unusable as error:
         return _Ingested(source.name, error=error)
     depth = files.depths.get(source.name)
-    return done if depth is None else _with_depth(done, depth, decoded, folder)
+    if depth is None:
+        return done
+    return _with_depth(done, depth, decoded, files.depths_as_stored, folder)
 
 
-def _with_depth(done: _Ingested, file: DepthFile, decoded: Decoded, folder: Path) -> _Ingested:
+def _with_depth(
+    done: _Ingested, file: DepthFile, decoded: Decoded, as_stored: bool, folder: Path
+) -> _Ingested:
     """Write the depth map of a photograph; returns the photograph with it, or with the reason why
-    the map cannot be used."""
+    the map cannot be used. as_stored: see `Findings.depths_as_stored`."""
     photo = done.photos[0]
     place = f"{FOLDERS[0]}/{photo.picture}.npy"
     try:
         if photo.face is not None:
             raise Unusable("it is a 360-degree picture", "Give maps of photographs only")
-        write_depth(folder / place, read_depth(file, decoded))
+        write_depth(folder / place, read_depth(file, decoded, as_stored))
     except Unusable as error:
         return replace(done, bad_depth=error)
     return replace(done, photos=(replace(photo, depth=place),))
@@ -244,7 +259,12 @@ def _write(picture: _Picture, settings: IngestSettings, folder: Path) -> _Ingest
     Unusable if a mask leaves no face. folder: of the stage's output."""
     name = picture.name
     masked = MaskedPhoto.of(
-        picture.decoded, name, picture.mask, settings.invert_masks, settings.mask_means
+        picture.decoded,
+        name,
+        picture.mask,
+        settings.invert_masks,
+        settings.mask_means,
+        picture.mask_as_stored,
     )
     if picture.sphere and settings.rig_mask is not None:
         masked = masked.without(settings.rig_mask, name)

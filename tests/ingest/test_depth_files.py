@@ -165,6 +165,45 @@ def test_photographs_of_a_folder_called_depth_are_photographs(photos: Path) -> N
     assert len(find(photos).sources) == 5
 
 
+@pytest.mark.parametrize(
+    "form", ["IMG_{}_depth.png", "IMG_{}.jpg.png", "IMG_{}.png", "IMG_{}.npy", "IMG_{}_depth.exr"]
+)
+def test_the_folder_of_maps_may_be_that_of_the_photographs(photos: Path, form: str) -> None:
+    for number in (1, 2, 3):
+        write_map(photos / form.format(number))
+        save(photos / f"IMG_{number}_mask.png", np.eye(64, 96, dtype=np.uint8) * 255)
+    capture, warnings = taken(photos, photos)
+    assert [photo.name for photo in capture.photos] == ["IMG_1.jpg", "IMG_2.jpg", "IMG_3.jpg"]
+    assert all(photo.mask for photo in capture.photos)
+    for found in maps_of(capture):
+        np.testing.assert_allclose(found, METRES, atol=1e-6)
+    assert not [code for code in warnings if code.startswith("ingest-depth")]
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+def test_maps_beside_photographs_are_no_photographs(photos: Path, suffix: str) -> None:
+    for number in (1, 2, 3):
+        write_map(photos / f"IMG_{number}_depth.{suffix}")
+    capture, warnings = taken(photos)
+    assert [photo.name for photo in capture.photos] == ["IMG_1.jpg", "IMG_2.jpg", "IMG_3.jpg"]
+    assert not any(photo.depth for photo in capture.photos)
+    assert f"IMG_2_depth.{suffix}" in warnings["ingest-depth-beside"]
+    assert "--depth" in warnings["ingest-depth-beside"]
+
+
+def test_masks_of_colmap_s_names_are_no_maps(photos: Path) -> None:
+    for number in (1, 2, 3):
+        write_map(photos / f"IMG_{number}_depth.png")
+        save(photos / f"IMG_{number}.jpg.png", np.eye(64, 96, dtype=np.uint8) * 255)
+    capture, _ = taken(photos, photos)
+    assert [bool(p.mask and p.depth) for p in capture.photos] == [True, True, True]
+
+
+def test_a_picture_of_8_bits_is_a_photograph_whatever_its_name(photos: Path) -> None:
+    save(photos / "IMG_1_depth.png", textured(7))
+    assert len(find(photos).sources) == 4
+
+
 def test_polycam_s_confidence_leaves_the_sure_pixels(photos: Path) -> None:
     write_map(photos.parent / "depth" / "IMG_1.png")
     sure = np.full((HIGH, WIDE), 255, np.uint8)

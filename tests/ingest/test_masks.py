@@ -16,7 +16,7 @@ from stages.ingest.find import find
 from stages.ingest.masks import masks_beside, pair_masks
 from stages.ingest.settings import IngestSettings
 from stages.scene import Capture
-from stages.scene.pictures import load_image
+from stages.scene.pictures import load_depth, load_image
 from tests.ingest.made_files import exif, folder_of, save, textured
 
 HALF = np.repeat(np.array([0, 255], np.uint8), 32)[:, None] * np.ones(
@@ -190,6 +190,72 @@ def test_a_mask_is_turned_as_its_photograph_is(photos: Path, tmp_path: Path) -> 
     capture, warnings = taken(photos, masks=masked(tmp_path / "m", photos))
     np.testing.assert_array_equal(mask_of(capture), np.rot90(HALF, -1))
     assert "ingest-mask-scaled" not in warnings
+
+
+UPPER_LEFT = np.zeros((64, 96), np.uint8)
+UPPER_LEFT[:32, :40] = 255
+
+
+def stored(upright: np.ndarray, orientation: int) -> np.ndarray:
+    """What a camera stores of it: the inverse of what the orientation does."""
+    turned = {
+        1: upright,
+        2: upright[:, ::-1],
+        3: np.rot90(upright, 2),
+        4: upright[::-1],
+        5: np.swapaxes(upright, 0, 1),
+        6: np.rot90(upright),
+        7: np.swapaxes(np.rot90(upright, 2), 0, 1),
+        8: np.rot90(upright, -1),
+    }
+    return np.ascontiguousarray(turned[orientation])
+
+
+def turned_capture(folder: Path, orientations: list[int], as_stored: list[bool]) -> Path:
+    """Photographs of these orientations, each with a mask and a depth map, upright or as stored."""
+    depth = np.linspace(1000, 3000, 64 * 96).reshape(64, 96).astype(np.uint16)
+    for number, (orientation, like) in enumerate(zip(orientations, as_stored, strict=True)):
+        picture = stored(textured(number), orientation)
+        save(folder / f"photos/{number}.jpg", picture, exif=exif(orientation=orientation))
+        for kind, upright in (("masks", UPPER_LEFT), ("depth", depth)):
+            save(folder / kind / f"{number}.png", stored(upright, orientation if like else 1))
+    return folder / "photos"
+
+
+def maps(capture: Capture) -> list[np.ndarray]:
+    depths = [load_depth(capture.folder / photo.depth) for photo in capture.photos]
+    return [mask_of(capture, number) for number in range(len(capture.photos))] + depths
+
+
+def test_masks_and_depth_as_stored_are_turned_alike(tmp_path: Path) -> None:
+    orientations = list(range(1, 9))
+    found = []
+    for like in (False, True):
+        photos = turned_capture(tmp_path / str(like), orientations, [like] * 8)
+        capture, warnings = taken(photos)
+        assert "ingest-mask-turn-unknown" not in warnings
+        found.append(maps(capture))
+        for number in orientations:
+            np.testing.assert_array_equal(mask_of(capture, number - 1), UPPER_LEFT)
+    for upright, turned in zip(*found, strict=True):
+        np.testing.assert_array_equal(turned, upright)
+
+
+def test_maps_whose_turn_nothing_tells_are_upright_with_a_warning(tmp_path: Path) -> None:
+    capture, warnings = taken(turned_capture(tmp_path, [1, 1, 3], [False] * 3))
+    np.testing.assert_array_equal(mask_of(capture, 2), UPPER_LEFT)
+    assert "2.jpg" in warnings["ingest-mask-turn-unknown"]
+    assert "0.jpg" not in warnings["ingest-mask-turn-unknown"]
+    _, warnings = taken(turned_capture(tmp_path / "1", [1, 1, 1], [True] * 3))
+    assert "ingest-mask-turn-unknown" not in warnings
+
+
+def test_maps_that_contradict_each_other_go_by_their_own_proportions(tmp_path: Path) -> None:
+    capture, warnings = taken(turned_capture(tmp_path, [6, 8, 3], [True, False, False]))
+    for number in range(3):
+        np.testing.assert_array_equal(mask_of(capture, number), UPPER_LEFT)
+    assert "2.jpg" in warnings["ingest-mask-turn-unknown"]
+    assert "0.jpg" not in warnings["ingest-mask-turn-unknown"]
 
 
 def test_labels_of_nought_and_one_are_a_mask(photos: Path, tmp_path: Path) -> None:

@@ -23,6 +23,13 @@ _DICTIONARIES = tuple(
 _SAMPLED = 12  # pictures in which each dictionary is tried
 _NARROWEST_DEG = 2.0  # triangulation angle; below, depth is too inaccurate
 _LARGEST_ERROR = 0.004  # reprojection error of a corner, in longer sides of the picture
+_FARTHEST_MOVE_PX = 2.0  # of a corner from where OpenCV has it
+# Profiles of brightness across each side: their number, where on the side, samples of each, and how
+# far it goes to both sides of the edge, in pixels and at most in lengths of the side.
+_PROFILES, _PART_OF_SIDE, _SAMPLES = 64, (0.1, 0.9), 25
+_PROFILE_PX, _PROFILE_SHARE = 4.0, 0.075
+_NOISE = 0.15  # of the steepest slope of a profile; less does not count
+_WEAKEST_EDGE = 0.5  # of the median contrast; less: something covers the edge
 
 Seen = list[tuple[int, NDArray[np.float64]]]  # (camera, corners [4, 2] in pixels)
 
@@ -61,13 +68,73 @@ def _detected(detector: Any, picture: Path) -> dict[int, NDArray[np.float64]]:
     if grey is None:
         return {}
     corners, numbers, _ = detector.detectMarkers(grey)
-    flat = [] if numbers is None else np.ravel(numbers).tolist()
+    if numbers is None:
+        return {}
+    flat, brightness = np.ravel(numbers).tolist(), np.asarray(grey, np.float32)
     return {
-        number: np.asarray(found, np.float64).reshape(4, 2)
+        number: _refined(brightness, np.asarray(found, np.float64).reshape(4, 2))
         + 0.5  # OpenCV has pixel centres at whole numbers
         for number, found in zip(flat, corners, strict=True)
         if flat.count(number) == 1
     }
+
+
+def _refined(grey: NDArray[np.float32], corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[4, 2] the intersections of lines that are fitted to the sides of a marker. OpenCV moves
+    corners [4, 2] inwards, more so in small or blurred markers, because it sees one quadrant of
+    black and three of white. A corner stays where a line fails or would move it too far."""
+    points, ends = corners, np.roll(corners, -1, axis=0)
+    for _ in range(2):  # the second time edges lie in the middle of the profiles
+        points, ends = _edge_lines(grey, points, ends)
+    along = ends - points
+    before, lines_before = np.roll(points, 1, axis=0), np.roll(along, 1, axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        factor = _cross(points - before, along) / _cross(lines_before, along)
+    crossed = before + factor[:, None] * lines_before
+    moved = np.linalg.norm(crossed - corners, axis=1)
+    return np.where((moved <= _FARTHEST_MOVE_PX)[:, None], crossed, corners)
+
+
+def _edge_lines(
+    grey: NDArray[np.float32], points: NDArray[np.float64], ends: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Two points [4, 2] each on the four edges from black to white near the lines from `points` to
+    `ends`; NaN where too little of an edge is visible."""
+    along = ends - points
+    length = np.linalg.norm(along, axis=1)[:, None, None]
+    normals = np.stack([along[:, 1], -along[:, 0]], axis=1) / length[:, 0]  # outwards
+    share = np.linspace(*_PART_OF_SIDE, _PROFILES)
+    offsets = np.linspace(-1, 1, _SAMPLES) * np.minimum(_PROFILE_PX, length * _PROFILE_SHARE)
+    on_side = points[:, None] + share[:, None] * along[:, None]
+    at = on_side[:, :, None] + offsets[..., None] * normals[:, None, None]
+    inside = np.all((at >= 0) & (at <= np.array(grey.shape[::-1]) - 1), axis=(2, 3))
+    known = np.nan_to_num(at, nan=-1.0).astype(np.float32).reshape(-1, _SAMPLES, 2)
+    x, y = np.ascontiguousarray(np.moveaxis(known, -1, 0))
+    profiles = cv2.remap(grey, x, y, cv2.INTER_LINEAR).reshape(at.shape[:3])
+    slopes = np.maximum(np.diff(profiles, axis=2), 0.0)  # from black outwards to white
+    slopes *= slopes > _NOISE * slopes.max(axis=2, keepdims=True)
+    weights = slopes.sum(axis=2)
+    middles = (offsets[..., 1:] + offsets[..., :-1]) / 2
+    edges = (slopes * middles).sum(axis=2) / np.maximum(weights, 1e-9)
+    seen = inside & (weights > _WEAKEST_EDGE * np.median(weights, axis=1, keepdims=True))
+    shifts = np.array([_line(share[s], e[s]) for s, e in zip(seen, edges, strict=True)])
+    return points + shifts[:, :1] * normals, ends + shifts[:, 1:] * normals
+
+
+def _line(at: NDArray[np.float64], values: NDArray[np.float64]) -> tuple[float, float]:
+    """Values at 0 and at 1 of a line through most of the points; NaN for too few points."""
+    for _ in range(3):
+        if len(at) < _PROFILES / 2:
+            return np.nan, np.nan
+        slope, start = np.polyfit(at, values, 1)
+        off = np.abs(values - start - slope * at)
+        near = off <= max(3 * float(np.median(off)), 0.05)
+        at, values = at[near], values[near]
+    return float(start), float(start + slope)
+
+
+def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
 def _triangulated(places: Seen, cameras: Sequence[Camera]) -> NDArray[np.float64] | None:

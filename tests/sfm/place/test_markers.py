@@ -67,6 +67,68 @@ def test_sides_of_markers_are_measured(tmp_path: Path, kind: str) -> None:
     assert np.abs(sides / SIDE - 1).max() < 0.02
 
 
+def poses() -> list[np.ndarray]:
+    places = [((-0.5, 0.0, 0.0), 0.25), ((0.5, 0.0, 0.0), -0.25), ((0.0, 0.3, 0.0), 0.0)]
+    found = []
+    for centre, yaw in places:
+        pose = np.eye(4)
+        pose[0, ::2], pose[2, ::2] = (np.cos(yaw), -np.sin(yaw)), (np.sin(yaw), np.cos(yaw))
+        pose[:3, 3] = -pose[:3, :3] @ centre
+        found.append(pose)
+    return found
+
+
+def exact_picture(camera: Camera, side: float, sub: int = 8) -> np.ndarray:
+    """A marker in the plane z = 2: the mean of sub x sub points of each pixel."""
+    words = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_6X6_50)
+    cells = cv2.aruco.generateImageMarker(words, 7, 8)
+    at = [(np.arange(n * sub) + 0.5) / sub for n in (camera.width, camera.height)]
+    x, y = np.meshgrid((at[0] - camera.cx) / camera.fx, (at[1] - camera.cy) / camera.fy)
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ camera.world_to_camera[:3, :3]
+    centre = camera.centre
+    on_plane = centre[:2] + rays[..., :2] * ((2 - centre[2]) / rays[..., 2])[..., None]
+    column, row = np.moveaxis(np.floor((on_plane / side + 0.5) * 8).astype(int), -1, 0)
+    far = np.maximum(np.abs(column - 3.5), np.abs(row - 3.5))
+    shown = np.where(far < 4, cells[np.clip(row, 0, 7), np.clip(column, 0, 7)], 255)
+    shown = np.where(far < 6, shown, 128).astype(np.float32)
+    return cv2.resize(shown, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+
+
+@pytest.mark.parametrize("pixels", [90, 45])
+@pytest.mark.parametrize("blur", [0, 1])
+def test_sides_are_not_too_short_in_small_or_blurred_pictures(
+    tmp_path: Path, pixels: int, blur: int
+) -> None:
+    side = pixels * 2.06 / 900
+    seen = [Camera(240, 240, 900.0, 900.0, 120.0, 120.0, pose) for pose in poses()]
+    paths = [tmp_path / f"{number}.png" for number in range(len(seen))]
+    for path, camera in zip(paths, seen, strict=True):
+        shown = exact_picture(camera, side)
+        shown = cv2.GaussianBlur(shown, (0, 0), blur) if blur else shown
+        cv2.imwrite(str(path), shown.round().astype(np.uint8))
+    sides = marker_sides(paths, seen)
+    assert len(sides) == 4
+    assert abs(np.median(sides) / side - 1) < 0.005
+
+
+def test_a_side_that_is_covered_in_part_is_measured(tmp_path: Path) -> None:
+    side = 90 * 2.06 / 900
+    seen = [Camera(240, 240, 900.0, 900.0, 120.0, 120.0, pose) for pose in poses()]
+    paths = [tmp_path / f"{number}.png" for number in range(len(seen))]
+    for path, camera in zip(paths, seen, strict=True):
+        corners, _ = camera.project(np.array([[-0.5, -0.5, 0], [0.5, 0.5, 0]]) * side + (0, 0, 2))
+        shown = exact_picture(camera, side)
+        # A grey strip hides a third of one side: its line comes from the other two thirds.
+        left, right = corners[0, 0], corners[1, 0]
+        middle = slice(int(left + (right - left) * 0.4), int(left + (right - left) * 0.7))
+        top = int(corners[0, 1])
+        shown[top - 6 : top + 4, middle] = 90
+        cv2.imwrite(str(path), shown.round().astype(np.uint8))
+    sides = marker_sides(paths, seen)
+    assert len(sides) == 4
+    assert np.abs(sides / side - 1).max() < 0.01
+
+
 def test_markers_of_a_stated_size_make_the_world_metric(tmp_path: Path) -> None:
     report = Report()
     pictures = photographs(tmp_path)
