@@ -59,13 +59,19 @@ def panorama(pixels: NDArray[np.uint8], stored: tuple[int, int], projection: str
         if projection == EQUIRECTANGULAR and abs(width / (2 * height) - 1) <= _RATIO:
             return SPHERE
         return f"a panorama ({projection}, {width} x {height}, as its metadata say)"
-    height, width = pixels.shape[:2]
-    if max(stored) != 2 * min(stored) or width <= height or width < _FEWEST:
+    if not look_decides(pixels, stored, projection):
         return ""
     small = _reduced(pixels)
     if _two_fisheyes(small):
         return _FISHEYES
     return SPHERE if _wraps(small) else ""
+
+
+def look_decides(pixels: NDArray[np.uint8], stored: tuple[int, int], projection: str) -> bool:
+    """Whether a picture may be a panorama and no metadata say so. Arguments as for `panorama`."""
+    height, width = pixels.shape[:2]
+    wide = max(stored) == 2 * min(stored) and width > height
+    return wide and width >= _FEWEST and not projection
 
 
 def hint_for(kind: str) -> str:

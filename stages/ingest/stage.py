@@ -23,7 +23,7 @@ from stages.ingest.faces import face_photos
 from stages.ingest.find import find
 from stages.ingest.masking import AUTO, MaskedPhoto, cuts_out_object
 from stages.ingest.masks import check_pairing, check_rig_mask, mask_folder
-from stages.ingest.panorama import SPHERE, hint_for, panorama
+from stages.ingest.panorama import SPHERE, hint_for, look_decides, panorama
 from stages.ingest.quality import Measures, measure, near_duplicates
 from stages.ingest.settings import IngestSettings
 from stages.ingest.sources import DepthFile, Findings, Source
@@ -47,6 +47,7 @@ class _Ingested:
         inside: share of the picture that its mask keeps.
         remarks: codes of `advice.TEXTS` that apply to it.
         bad_depth: why its depth map cannot be used.
+        looks: whether it looks like a panorama, if nothing else says whether it is one.
     """
 
     name: str
@@ -56,6 +57,7 @@ class _Ingested:
     inside: float = 1.0
     remarks: tuple[str, ...] = ()
     bad_depth: Unusable | None = None
+    looks: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -173,18 +175,43 @@ def _masks_cut_out(files: Findings, settings: IngestSettings) -> bool:
 def _ingest_photographs(
     files: Findings, settings: IngestSettings, folder: Path, report: Report
 ) -> list[_Ingested]:
-    """All photographs, in order; a few are read at once."""
+    """All photographs, in order.
+
+    An object before a plain wall can look like a panorama. So pictures that look like one are taken
+    for panoramas unless more of their shape do not.
+    """
+    ingested = _read_photographs(files.sources, None, files, settings, folder, report)
+    waiting = [i for i, one in enumerate(ingested) if one.looks]
+    if waiting:
+        spheres = len(waiting) >= sum(one.looks is False for one in ingested)
+        sources = [files.sources[i] for i in waiting]
+        read = _read_photographs(sources, spheres, files, settings, folder, report)
+        for i, one in zip(waiting, read, strict=True):
+            remarks = one.remarks if spheres else (*one.remarks, "ingest-panorama-doubtful")
+            ingested[i] = replace(one, remarks=remarks)
+    return ingested
+
+
+def _read_photographs(
+    sources: Sequence[Source],
+    spheres: bool | None,
+    files: Findings,
+    settings: IngestSettings,
+    folder: Path,
+    report: Report,
+) -> list[_Ingested]:
+    """Photographs, in order; a few are read at once. spheres: see `_ingest_photograph`."""
     budget = PixelBudget(_PIXELS_AT_ONCE)
     ingested: list[_Ingested] = []
-    total = len(files.sources)
+    total = len(sources)
     report.progress(0, total, "reading photographs")
     with readers_set_up(), ThreadPoolExecutor(threads.count()) as pool:
         futures: list[Future[_Ingested]] = [
-            pool.submit(_ingest_photograph, source, files, settings, folder, budget)
-            for source in files.sources
+            pool.submit(_ingest_photograph, source, spheres, files, settings, folder, budget)
+            for source in sources
         ]
         try:
-            for done, (source, future) in enumerate(zip(files.sources, futures, strict=True), 1):
+            for done, (source, future) in enumerate(zip(sources, futures, strict=True), 1):
                 ingested.append(future.result())
                 report.progress(done, total, source.name)
                 if report.stop_requested.is_set() and done < total:
@@ -195,11 +222,25 @@ def _ingest_photographs(
 
 
 def _ingest_photograph(
-    source: Source, files: Findings, settings: IngestSettings, folder: Path, budget: PixelBudget
+    source: Source,
+    spheres: bool | None,
+    files: Findings,
+    settings: IngestSettings,
+    folder: Path,
+    budget: PixelBudget,
 ) -> _Ingested:
+    """spheres: whether a picture that only looks like a panorama is one; None to leave it for
+    later, with `_Ingested.looks`."""
+    looks = None
     try:
         decoded = decode(source.path, settings.max_side, budget)
-        kind = panorama(decoded.pixels, decoded.stored, decoded.exif.projection)
+        about = decoded.pixels, decoded.stored, decoded.exif.projection
+        kind = panorama(*about)
+        if look_decides(*about):
+            looks = kind == SPHERE
+            if looks and spheres is None:
+                return _Ingested(source.name, looks=True)
+            kind = "" if looks and not spheres else kind
         if kind == SPHERE:
             decoded = decode(source.path, int(faces.WIDTHS * settings.max_side), budget)
         elif kind:
@@ -213,7 +254,7 @@ def _ingest_photograph(
             mask_as_stored=files.masks_as_stored,
             sphere=kind == SPHERE,
         )
-        done = _write(picture, settings, folder)
+        done = replace(_write(picture, settings, folder), looks=looks)
     except Unusable as error:
         return _Ingested(source.name, error=error)
     depth = files.depths.get(source.name)

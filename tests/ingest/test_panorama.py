@@ -120,3 +120,23 @@ def test_two_fisheyes_among_photographs_are_left_out_by_name(tmp_path: Path) -> 
     (message,) = [text for code, text in report.warnings if code == "ingest-left-out"]
     assert "two.png is left out: it is a pair of fisheye pictures side by side" in message
     assert "Stitch it" in message
+
+
+@pytest.mark.parametrize(("ordinary", "faces"), [(3, False), (1, True)])
+def test_pictures_that_look_like_panoramas_are_what_most_of_their_shape_are(
+    tmp_path: Path, ordinary: int, faces: bool
+) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for number in range(2):
+        Image.fromarray(sphere(number)).save(folder / f"like{number}.png")
+    for number, path in enumerate(sorted(SAMPLE.glob("*.jpg"))[:ordinary]):
+        Image.fromarray(cropped(path)).save(folder / f"photo{number}.png")
+    report = Report()
+    capture = ingest.run({"photos": folder}, IngestSettings(), tmp_path / "out", report)
+    assert report.metrics["photographs"] == 2 + ordinary
+    assert report.metrics["panoramas"] == (2 if faces else 0)
+    assert any(photo.face is not None for photo in capture.photos) == faces
+    doubtful = [text for code, text in report.warnings if code == "ingest-panorama-doubtful"]
+    assert bool(doubtful) != faces
+    assert all("like0.png, like1.png" in text for text in doubtful)
