@@ -59,13 +59,13 @@ def _decide(
         maps: of all photographs.
         size_of: the size of a map; None if it cannot be read.
     """
-    told: dict[str, bool | None] = {}
+    kind_of: dict[str, bool | None] = {}
     for name, (stored, orientation) in turned.items():
         size = size_of(maps[name]) if name in maps else None
         if size is not None:
             upright = stored[::-1] if orientation >= 5 else stored
             as_stored = masking.same_aspect(size, stored)
-            told[name] = as_stored if as_stored != masking.same_aspect(size, upright) else None
-    kinds = set(told.values()) - {None}
-    unknown = {name for name, kind in told.items() if kind is None}
+            kind_of[name] = as_stored if as_stored != masking.same_aspect(size, upright) else None
+    kinds = set(kind_of.values()) - {None}
+    unknown = {name for name, kind in kind_of.items() if kind is None}
     return kinds == {True}, set() if len(kinds) == 1 else unknown
