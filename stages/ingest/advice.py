@@ -35,8 +35,9 @@ TEXTS = {  # by code, in the order of the warnings; {names} of files or photogra
     "Switch HDR off in the camera, or export as SDR.",
     "ingest-colour-profile": "The colour profile is damaged, so sRGB was assumed: {names}. "
     "Export these photographs again if their colours look wrong.",
-    "ingest-panorama-doubtful": "Taken as photographs, as most pictures of their shape are, although "
-    "they look like 360-degree panoramas: {names}. Panoramas belong in a capture of their own.",
+    "ingest-panorama-unclear": "These pictures look like 360-degree panoramas, and most of their "
+    "shape do not, so they are taken as photographs: {names}. Panoramas belong in a capture of "
+    "their own.",
     "ingest-gps-contradicts": "Exif and XMP state places more than 50 m apart: {names}. The GPS of "
     "these photographs is not used. Write one of the two anew, or remove it.",
     "ingest-transparency": "Transparent parts are treated as empty space: {names}. "

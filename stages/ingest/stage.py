@@ -187,7 +187,7 @@ def _ingest_photographs(
         sources = [files.sources[i] for i in waiting]
         read = _read_photographs(sources, spheres, files, settings, folder, report)
         for i, one in zip(waiting, read, strict=True):
-            remarks = one.remarks if spheres else (*one.remarks, "ingest-panorama-doubtful")
+            remarks = one.remarks if spheres else (*one.remarks, "ingest-panorama-unclear")
             ingested[i] = replace(one, remarks=remarks)
     return ingested
 

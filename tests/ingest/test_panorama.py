@@ -137,6 +137,6 @@ def test_pictures_that_look_like_panoramas_are_what_most_of_their_shape_are(
     assert report.metrics["photographs"] == 2 + ordinary
     assert report.metrics["panoramas"] == (2 if faces else 0)
     assert any(photo.face is not None for photo in capture.photos) == faces
-    doubtful = [text for code, text in report.warnings if code == "ingest-panorama-doubtful"]
-    assert bool(doubtful) != faces
-    assert all("like0.png, like1.png" in text for text in doubtful)
+    unclear = [text for code, text in report.warnings if code == "ingest-panorama-unclear"]
+    assert bool(unclear) != faces
+    assert all("like0.png, like1.png" in text for text in unclear)
