@@ -152,6 +152,9 @@ async function start() {
         return { name, splats: app.stats.frame.gsplats, renderer: app.graphicsDevice.deviceType };
     };
     window.splatStarted = true;
+    // An error of another script, an extension's say, may have been reported while the page loaded.
+    document.body.classList.remove("failed");
+    find("message").setAttribute("role", "status");
     find("message").hidden = true;
     const heldOut = scene.shots.find((shot) => shot.held_out);
     const first = named(query.get("camera")) || heldOut || scene.shots[0];
