@@ -25,12 +25,15 @@ from stages.editing.regions import parse_numbers
 from stages.formats import format_of, html, ply, units_of
 from stages.formats.replacement import check_target
 from stages.formats.values import drop_undrawable
+from stages.page.sizes import blurred
 from stages.run import results
 from stages.run.pipeline import Pipeline
 from stages.scene import Splats
 from stages.viewer.render_cameras import camera_of_view
 from stages.viewer.server import Item, LocalServer, Response, open_in_browser
 from stages.viewer.site import site
+
+_BLURRED = "view-blurred"
 
 
 def _of_page(help: str, shown: str | bool = True, metavar: str | None = None) -> Any:
@@ -105,7 +108,8 @@ def _server(items: dict[str, Item | Response], port: int) -> LocalServer:
 
 
 def _loaded(target: Path | None) -> tuple[Splats, Pipeline | None]:
-    """As `load_target`, without what cannot be drawn. Raises SplatError."""
+    """As `load_target`, without what cannot be drawn. Warns of what the page cannot show. Raises
+    SplatError."""
     splats, pipeline = load_target(target)
     splats, _ = drop_undrawable(splats)
     if not len(splats):
@@ -115,6 +119,8 @@ def _loaded(target: Path | None) -> tuple[Splats, Pipeline | None]:
             wanted="At least one.",
             hint="See what it holds with `splat info`.",
         )
+    if text := blurred(splats):
+        console.warn(f"Warning: {text} ({_BLURRED})")
     return splats, pipeline
 
 

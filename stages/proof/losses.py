@@ -16,6 +16,7 @@ from stages.formats import Format, format_of
 from stages.formats.codecs import CODECS
 from stages.formats.compressed_ply import outlier_shells
 from stages.formats.offset import is_located, offset_path
+from stages.page.sizes import blurred
 from stages.proof.compare import Change
 from stages.proof.prover import DROP_OUTLIERS, Proof, Prover
 from stages.scene import Splats
@@ -55,6 +56,8 @@ def losses_of(path: Path, splats: Splats, proof: Proof) -> dict[str, str]:
             f"{name} has no field for where the scene lies, which was written to "
             f"{offset_path(path).name}."
         )
+    if row.ending == "html" and (text := blurred(splats)):
+        losses["blurred"] = text
     if row.on_globe and splats.place is None:
         losses["place"] = (
             f"{name} has no place on the earth: globes show it at their centre, unless their "

@@ -37,7 +37,8 @@ class LivePage:
     """The content of the page.
 
     Attributes: `items`, what to serve by address; `frames`, where the trainer offers to draw;
-    `end_delivered`, whether a browser has received the end and the last frame.
+    `end_delivered`, whether a browser has received the end and the last frame; `ended_at`, when
+    the end was noted, by `time.monotonic`.
 
     Args:
         views: the capture's views.
@@ -56,6 +57,7 @@ class LivePage:
     ) -> None:
         self.frames = LiveFrames()
         self.end_delivered = self._end_requested = False
+        self.ended_at = np.inf
         self._cameras = [shot.camera for shot in shots]
         self._state: dict[str, Any] = {"phase": "", "done": 0, "total": 0, "end": ""}
         self._start, self._first = time.monotonic(), 0
@@ -97,6 +99,7 @@ class LivePage:
         """how: "finished" or "stopped"; only the first call counts. The page gets it with its next
         request for the state."""
         self.frames.close()
+        self.ended_at = min(self.ended_at, time.monotonic())
         self._state = {**self._state, "end": self._state["end"] or how}
 
     def _answer_state(self, query: dict[str, str]) -> Item:

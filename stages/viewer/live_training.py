@@ -16,7 +16,8 @@ from stages.viewer.live_page import LivePage
 from stages.viewer.server import LocalServer
 
 _STAGE = "train"
-_GRACE_PERIOD_S = 5.0  # for an open page to fetch the last state; it polls about twice a second
+_GRACE_PERIOD_S = 5.0  # for an open page to fetch the last state and the last frame
+_ALL_POLL_S = 1.5  # in which each open page polls, also a hidden one, whose browser slows it down
 
 
 class LiveTraining(Listener):
@@ -82,5 +83,8 @@ class LiveTraining(Listener):
 
     def _wait_for_page(self, page: LivePage) -> None:
         deadline = time.monotonic() + _GRACE_PERIOD_S
-        while page.frames.is_watched() and not page.end_delivered and time.monotonic() < deadline:
+        while page.frames.is_watched() and time.monotonic() < deadline:
+            # One page has the end: several may be open, and the others poll a little later.
+            if page.end_delivered and time.monotonic() > page.ended_at + _ALL_POLL_S:
+                break
             time.sleep(0.05)

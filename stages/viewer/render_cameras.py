@@ -74,11 +74,14 @@ def camera_of_view(splats: Splats, views: Sequence[View], name: str | None) -> C
             return candidates[0]
     if name.isdecimal() and int(name) < len(views):
         return views[int(name)].camera
-    known = f"{views[0].name} ... {views[-1].name}" if views else "none: a file has no cameras"
+    wanted = "No --camera: a file has none of its photographs' cameras."
+    if views:
+        numbers = f"a number from 0 to {len(views) - 1}"
+        wanted = f"A photograph's name, or {numbers} ({views[0].name} ... {views[-1].name})."
     raise UsageError(
         "render-camera",
         given=f"There is no camera {name}.",
-        wanted=f"A photograph's name, or a number from 0 to {max(0, len(views) - 1)} ({known}).",
+        wanted=wanted,
         hint="Leave --camera away, or name a run folder whose photographs you want to see.",
     )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 from contextlib import nullcontext
 from dataclasses import replace
@@ -234,6 +235,18 @@ def test_a_camera_that_is_no_name_and_no_number_is_refused(splat, scene: Path, n
     result = splat("render", str(scene), "--out", "a.png", f"--camera={name}")
     assert result.exit_code == 2
     assert "render-camera" in result.stderr
+
+
+def test_where_there_are_no_photographs_no_camera_is_advised(splat, scene: Path) -> None:
+    result = splat("render", str(scene), "--out", "a.png", "--camera", "zero")
+    assert result.exit_code == 2
+    assert not re.search(r"number from|\d to \d", result.stderr)
+    assert "none of its photographs' cameras" in " ".join(result.stderr.split())
+
+
+def test_a_wrong_camera_is_told_the_right_ones(splat, scene: Path, captured) -> None:
+    result = splat("render", str(scene), "--out", "a.png", "--camera", "8")
+    assert "a number from 0 to 7 (0.jpg ... 7.jpg)" in " ".join(result.stderr.split())
 
 
 def test_a_file_without_cameras_is_no_path(splat, scene: Path) -> None:

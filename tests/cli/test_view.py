@@ -16,6 +16,7 @@ import urllib.request
 import webbrowser
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -46,6 +47,19 @@ def test_a_page_that_is_written_says_the_units_of_its_file(splat, tmp_path: Path
     formats.write(tmp_path / "a.ply", many_splats(20), units="metres")
     assert splat("view", "a.ply", "--save", "client.html").exit_code == 0
     assert formats.units_of(tmp_path / "client.html") == "metres"
+
+
+@pytest.mark.parametrize(("factor", "warned"), [(1.0, False), (1e-6, True)])
+def test_a_scene_too_small_for_the_page_is_told(
+    splat, tmp_path: Path, factor: float, warned: bool
+) -> None:
+    scene = many_splats(20)
+    scene.log_scales[:] = np.log(0.1 * factor)
+    formats.write(tmp_path / "a.ply", scene)
+    result = splat("view", "a.ply", "--save", "client.html")
+    assert result.exit_code == 0
+    assert ("(view-blurred)" in result.stderr) == warned
+    assert ("--scale 1e4" in result.stderr) == warned
 
 
 def test_a_page_is_not_written_onto_what_is_read_or_what_an_asset_needs(

@@ -153,3 +153,19 @@ def test_a_splat_that_lies_elsewhere_is_not_put_down_to_rounding(tmp_path: Path)
     assert "1 of 2,000 splats lie elsewhere, by up to 3.54 units" in text
     assert "32 bits" not in text
     assert "hold them" not in text
+
+
+def small(factor: float) -> Splats:
+    splats = solid(200)
+    splats.log_scales[:] += np.float32(np.log(factor))
+    return replace(splats, means=splats.means * np.float32(factor))
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda words: words[0])
+def test_a_page_that_blurs_small_splats_says_so(tmp_path: Path, command: list[str]) -> None:
+    (warning,) = warnings_of(tmp_path, small(1e-4), "b.html", command)
+    assert "blurred" in warning
+    scale = warning.partition("--scale ")[2].partition("`")[0]
+    assert not warnings_of(tmp_path, small(1e-4 * float(scale)), "c.html", command)
+    assert not warnings_of(tmp_path, small(1e-2), "d.html", command)
+    assert not warnings_of(tmp_path, small(1e-4), "e.ply", command)

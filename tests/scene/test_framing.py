@@ -86,3 +86,16 @@ def test_splats_that_cannot_be_drawn_do_not_decide() -> None:
     scene.log_scales[20:30] = 1e30
     assert np.isfinite(front_camera(scene).world_to_camera).all()
     assert np.isfinite(front_camera(scene[:0]).world_to_camera).all()
+
+
+@pytest.mark.parametrize("count", [1, 5])
+@pytest.mark.parametrize("sigma", [1e-5, 1e-3, 0.1, 100.0])
+def test_splats_in_one_place_are_seen_from_outside_of_them(sigma: float, count: int) -> None:
+    middle = np.array([1.0, 2.0, 3.0])
+    scene = joined((np.tile(middle, (count, 1)), sigma, (1.0, 0.9, 0.8)))
+    for camera in (front_camera(scene), *orbit_cameras(scene, 3, 0.5)):
+        assert 3 <= np.linalg.norm(camera.centre - middle) / sigma < 30
+        image = render(scene, camera).image[..., 0]
+        border = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
+        assert image[image.shape[0] // 2, image.shape[1] // 2] > 0.8
+        assert border.mean() < 0.2

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,6 +31,9 @@ from tests.viewer.screenshots import (
 SAME_DB = 30.0
 """The viewer keeps scales and rotations as 16-bit floats, cuts splats off earlier and blends in 8
 bits; on this scene that costs about 35 dB."""
+
+PLACE = """(camera => [camera.getPosition(), camera.forward].map(({ x, y, z }) => [x, y, z]))
+    (splatSelection.app.root.findByName("camera"))"""
 
 
 @pytest.fixture(scope="module")
@@ -102,6 +108,32 @@ def test_the_photograph_is_shown_beside_until_the_camera_moves(
     assert browser.run(note) == ""
     browser.run("document.querySelector('.sse-flyCamera').click()")
     assert "Moved" in browser.run(note)
+
+
+@pytest.mark.parametrize("wait_s", [0.0, 0.2, 0.6])
+def test_a_touch_soon_after_a_camera_was_chosen_does_not_throw_the_picture_back(
+    browser: Browser, address: str, wait_s: float
+) -> None:
+    """Nor does the viewer's own camera, which takes a while to get there, go on after it."""
+    browser.resize((900, 700))
+    browser.open(address + "?webgl")
+    browser.run("window.splatReady")
+    shots = json.loads(browser.run("document.getElementById('scene').textContent"))["shots"]
+    shot = next(shot for shot in shots if shot["name"] == views()[2].name)
+    browser.run(f"void splatShow({shot['name']!r})")
+    time.sleep(wait_s)
+    at: dict[str, Any] = {"x": 450, "y": 500, "button": "right", "clickCount": 1}
+    browser.call("Input.dispatchMouseEvent", type="mousePressed", **at)
+    towards = np.subtract(shot["target"], shot["position"])
+    depth = float(np.linalg.norm(towards))
+    for _ in range(2):
+        browser.run("new Promise(done => splatSelection.app.once('frameend', done))")
+        position, forward = np.array(browser.run(PLACE))
+        assert np.linalg.norm(position - shot["position"]) < 0.02 * depth
+        assert np.degrees(np.arccos(min(1, forward @ towards / depth))) < 1
+        browser.call("Input.dispatchMouseEvent", type="mouseReleased", **at)
+        browser.run("splatSelection.app.renderNextFrame = true; 0")
+    assert "Moved" in browser.run("document.getElementById('note').textContent")
 
 
 def test_splats_that_cannot_be_loaded_are_reported(browser: Browser, tmp_path: Path) -> None:

@@ -186,6 +186,54 @@ def test_right_dragging_moves_the_scene_and_the_wheel_zooms(browser: Browser, wo
     assert depths[1] == pytest.approx(depths[0] * np.exp(-0.2))
 
 
+@pytest.fixture
+def touched(browser: Browser) -> Iterator[Browser]:
+    browser.call("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=3)
+    yield browser
+    browser.call("Emulation.setTouchEmulationEnabled", enabled=False)
+
+
+def fingers(browser: Browser, kind: str, *places: tuple[int, int]) -> None:
+    points = [{"x": x, "y": y, "id": number} for number, (x, y) in enumerate(places)]
+    browser.call("Input.dispatchTouchEvent", type=kind, touchPoints=points)
+    # Pages are told of motion once a frame.
+    frame = "requestAnimationFrame(() => requestAnimationFrame(done))"
+    browser.run(f"new Promise(done => {frame})")
+
+
+def test_two_fingers_zoom_and_move_and_do_not_turn(touched: Browser, worker: Any) -> None:
+    bare(touched, worker.address)
+    _, before = shown(touched)
+    camera = views()[0].camera
+    pivot = camera.centre + median_depth(camera, coloured_scene().means) * camera.forward
+    fingers(touched, "touchStart", (140, 120))
+    fingers(touched, "touchStart", (140, 120), (180, 120))
+    for out in range(4, 21, 4):
+        fingers(touched, "touchMove", (140 - out, 120), (180 + out, 120))
+    _, closer = shown(touched)
+    for step in range(1, 6):
+        x, y = 3 * step, 120 - 2 * step
+        fingers(touched, "touchMove", (120 + x, y), (200 + x, y))
+    _, aside = shown(touched)
+    fingers(touched, "touchEnd")
+    fingers(touched, "touchStart", (150, 120))
+    fingers(touched, "touchMove", (190, 120))
+    fingers(touched, "touchEnd")
+    _, turned = shown(touched)
+
+    def degrees(one: np.ndarray, other: np.ndarray) -> float:
+        cosine = (np.trace(one[:3, :3] @ other[:3, :3].T) - 1) / 2
+        return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+    depths = [(m[:3, :3] @ pivot + m[:3, 3])[2] for m in (before, closer)]
+    assert depths[1] == pytest.approx(depths[0] / 2, rel=1e-6)
+    travelled = seen_at(aside, camera, pivot) - seen_at(closer, camera, pivot)
+    np.testing.assert_allclose(travelled, [15, -10], atol=0.5)
+    assert degrees(before, closer) < 1
+    assert degrees(before, aside) < 1
+    assert degrees(aside, turned) > 5
+
+
 def test_the_picture_follows_training_and_the_end_is_shown(browser: Browser, worker: Any) -> None:
     bare(browser, worker.address)
     picture, _ = shown(browser)

@@ -74,6 +74,46 @@ def test_training_is_served_from_its_start_to_the_end_of_the_run(watcher, said) 
         get(address + "state")
 
 
+def test_each_of_two_open_pages_sees_the_end(watcher, said) -> None:
+    watcher.started(TRAIN, 4, "has not run yet", False)
+    address = said[0]
+    watcher.progressed(TRAIN, "training", 1, 1, {})
+    seen: list[str] = []
+
+    def follow(delay_s: float) -> None:
+        time.sleep(delay_s)
+        try:
+            while not (end := get(address + "state")["end"]):
+                time.sleep(0.5)
+            get(f"{address}picture?shot=0&side=64&place=1,0,0,0,0,1,0,0,0,0,1,4")
+        except OSError:
+            end = "no answer"
+        seen.append(end)
+
+    pages = [threading.Thread(target=follow, args=(delay_s,)) for delay_s in (0.0, 0.25)]
+    for page in pages:
+        page.start()
+    time.sleep(0.4)
+    watcher.finished(TRAIN, 4, SimpleNamespace())
+    watcher.ended()
+    for page in pages:
+        page.join()
+    assert seen == ["finished", "finished"]
+
+
+def test_pages_that_saw_the_end_long_ago_are_not_waited_for(
+    watcher, said, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    watcher.started(TRAIN, 4, "has not run yet", False)
+    watcher.progressed(TRAIN, "training", 1, 1, {})
+    watcher.finished(TRAIN, 4, SimpleNamespace())
+    get(said[0] + "state")
+    get(f"{said[0]}picture?shot=0&side=64&place=1,0,0,0,0,1,0,0,0,0,1,4")
+    watcher._page.ended_at -= 60
+    monkeypatch.setattr(time, "sleep", lambda s: pytest.fail("waited"))
+    watcher.ended()
+
+
 def test_a_run_that_ends_early_says_so_and_waits_only_for_an_open_page(
     watcher, said, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -22,6 +22,7 @@ NO_GRAPHICS = """
 HTMLCanvasElement.prototype.getContext = () => null;
 Object.defineProperty(navigator, "gpu", { value: undefined });
 """
+OTHERS_ERROR = "document.addEventListener('DOMContentLoaded', () => {{ {} }});"
 SHOWN = """(message => [message.getAttribute("role"), message.textContent,
     message.checkVisibility(),
     document.getElementById("view").checkVisibility({visibilityProperty: true})])
@@ -77,6 +78,19 @@ def test_a_page_that_was_cut_off_is_told_so(browser: Browser, page: Path, cut: f
     page.write_bytes(whole[: int(cut * len(whole))])
     text = failure(browser, page.as_uri())
     assert "not complete" in text or "Invalid or unexpected token" in text or "end of input" in text
+
+
+@pytest.mark.parametrize("error", ["Promise.reject(new Error('x'))", "throw new Error('x')"])
+def test_an_early_error_of_another_script_does_not_hide_the_scene(
+    browser: Browser, page: Path, error: str
+) -> None:
+    with before_scripts(browser, OTHERS_ERROR.format(error)):
+        browser.open(page.as_uri() + "?webgl")
+        browser.run("window.splatReady")
+    role, _, visible, scene_visible = browser.run(SHOWN)
+    assert (role, visible, scene_visible) == ("status", False, True)
+    assert not browser.run("document.body.classList.contains('failed')")
+    assert browser.picture().max() > 0.5
 
 
 def test_damaged_splats_are_told(browser: Browser, page: Path) -> None:

@@ -118,24 +118,36 @@ function moved() {
     changed();
 }
 
+// One finger, or the mouse, turns or moves; a second one zooms, and both move what is between them.
+function dragged([x, y], event, other) {
+    const box = image.getBoundingClientRect();
+    const { width, height, fx } = live.shot;
+    const pixel = 1 / (fx * Math.min(box.width / width, box.height / height));
+    const [right, down] = [event.clientX - x, event.clientY - y];
+    if (other) {
+        const before = Math.hypot(x - other[0], y - other[1]);
+        const after = Math.hypot(event.clientX - other[0], event.clientY - other[1]);
+        orbit.shift((-right * pixel) / 2, (-down * pixel) / 2, 0); // the other finger moves the rest
+        orbit.zoom(Math.max(1, before) / Math.max(1, after));
+    } else if (event.buttons & 1 && !event.shiftKey) orbit.turn(-right * TURN, -down * TURN);
+    else orbit.shift(-right * pixel, -down * pixel, 0);
+}
+
 function listen() {
-    let from = null;
+    const fingers = new Map(); // where each pointer was last; a third one does nothing
     image.draggable = false;
     image.onpointerdown = (event) => {
-        from = [event.clientX, event.clientY];
+        if (fingers.size < 2) fingers.set(event.pointerId, [event.clientX, event.clientY]);
         image.setPointerCapture(event.pointerId);
     };
-    image.onpointerup = image.onpointercancel = () => (from = null);
+    image.onpointerup = image.onpointercancel = (event) => fingers.delete(event.pointerId);
     image.oncontextmenu = (event) => event.preventDefault();
     image.onpointermove = (event) => {
+        const from = fingers.get(event.pointerId);
         if (!from) return;
-        const [x, y] = [event.clientX - from[0], event.clientY - from[1]];
-        from = [event.clientX, event.clientY];
-        const box = image.getBoundingClientRect();
-        const { width, height, fx } = live.shot;
-        const pixel = 1 / (fx * Math.min(box.width / width, box.height / height));
-        if (event.buttons & 1 && !event.shiftKey) orbit.turn(-x * TURN, -y * TURN);
-        else orbit.shift(-x * pixel, -y * pixel, 0);
+        const other = [...fingers].find(([pointer]) => pointer !== event.pointerId);
+        dragged(from, event, other && other[1]);
+        fingers.set(event.pointerId, [event.clientX, event.clientY]);
         moved();
     };
     image.addEventListener("wheel", (event) => {

@@ -5,6 +5,7 @@
 // selected.
 // Sorting runs beside drawing and takes a few frames to be seen; every ten, the streamed levels are chosen again.
 const STEADY_FRAMES = 12;
+const FLIGHT_S = 10; // more than any flight of the viewer takes
 
 const rgbOf = (hex) => [1, 3, 5].map((at) => parseInt(hex.slice(at, at + 2), 16) / 255);
 
@@ -80,6 +81,14 @@ function frameBy(act) {
     for (const button of document.querySelectorAll(".sse-frame")) button.addEventListener("click", instead, true);
 }
 
+// Ends the viewer's flight to a camera: a touch would let go of the lens in the middle of it. Keys
+// that are held would fly for as long.
+function endFlight(viewer) {
+    viewer.state.inputEnabled = false;
+    viewer.app.fire("update", FLIGHT_S);
+    viewer.state.inputEnabled = true;
+}
+
 // While points are named, a click does not turn the camera to what it hits, as it does in orbit mode.
 function holdWhileNaming(events) {
     const { fire } = events;
@@ -133,6 +142,7 @@ async function start() {
     if (streamed) window.splatLevels = new Levels(app, meta, scene.levels);
     const show = (shot) => {
         viewer.selectAnnotation(scene.shots.indexOf(shot)); // where orbiting goes on from
+        endFlight(viewer);
         lens.hold(shot);
         if (panel) panel.shown(shot);
         return steady(app);
@@ -152,6 +162,9 @@ async function start() {
         return { name, splats: app.stats.frame.gsplats, renderer: app.graphicsDevice.deviceType };
     };
     window.splatStarted = true;
+    // An error of another script, an extension's say, may have been reported while the page loaded.
+    document.body.classList.remove("failed");
+    find("message").setAttribute("role", "status");
     find("message").hidden = true;
     const heldOut = scene.shots.find((shot) => shot.held_out);
     const first = named(query.get("camera")) || heldOut || scene.shots[0];
