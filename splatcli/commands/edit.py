@@ -104,10 +104,12 @@ def _edit(
 
 
 def _axis_warning(source: Path, target: Path, parsed: Sequence[ParsedOperation]) -> list[str]:
-    """What is said of a file whose vertical axis is another one, unless the splats are turned."""
-    if not source.is_file() or any(one.name in ("up", "rotate") for one in parsed):
+    """What is said of files whose vertical axis is another one, unless the splats are turned."""
+    if any(one.name in ("up", "rotate") for one in parsed):
         return []
-    return [*filter(None, [vertical_warning(source, target)])]
+    merged = [Path(one.value) for one in parsed if one.name == "merge"]
+    own = [vertical_warning(source, target)] if source.is_file() else []
+    return [*filter(None, [*own, *(vertical_warning(path) for path in merged)])]
 
 
 def _check_place(target: Path, scene: EditedScene) -> None:

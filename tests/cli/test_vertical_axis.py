@@ -73,6 +73,13 @@ def test_the_advice_turns_it_upright(tmp_path: Path) -> None:
     assert "vertical" not in warnings_of("info", path)
 
 
+def test_the_vertical_axis_of_a_merged_file_is_told(tmp_path: Path) -> None:
+    path, lying = flat(tmp_path / "a.ply", "x"), flat(tmp_path / "b.ply", "Vertical Axis: z")
+    merge = "edit", path, tmp_path / "c.ply", "--merge", lying
+    assert f"splat edit {lying} upright.ply --up +z" in warnings_of(*merge)
+    assert warnings_of(*merge, "--up", "+z") == "[]"
+
+
 def test_the_coordinates_stay_those_of_the_file(tmp_path: Path) -> None:
     plain, said = flat(tmp_path / "a.ply", "x"), flat(tmp_path / "b.ply", "Vertical Axis: z")
     assert (formats.read(plain).means == formats.read(said).means).all()
