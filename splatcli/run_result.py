@@ -57,9 +57,10 @@ def show(pipeline: Pipeline, until: str | None) -> None:
     peak_mib = max((m.peak_memory_mib for m in manifests), default=0.0)
     rows.append(("all", console.duration(total_s), memory(peak_mib), ""))
     console.table(("stage", "time", "peak memory", "result"), rows)
-    for manifest in manifests:
-        show_choice(manifest)
-        show_quality(manifest)
+    by_stage = {manifest.stage: manifest for manifest in manifests}
+    if training := by_stage.get("train"):
+        show_choice(training)
+        show_quality(training, by_stage.get("prune"))
     if assets:
         console.out.print()
         console.columns(
@@ -115,12 +116,12 @@ def headline(manifest: Manifest) -> str:
     return console.figures(counts)
 
 
-def show_choice(manifest: Manifest) -> None:
+def show_choice(training: Manifest) -> None:
     """Print what the number of training views decided: nothing where --steps, --seconds or
     --splats did."""
-    metrics, settings = manifest.metrics, manifest.settings
+    metrics, settings = training.metrics, training.settings
     given = any(settings.get(name) for name in ("steps", "seconds", "splats"))
-    if manifest.stage != "train" or given or "splat_cap" not in metrics:
+    if given or "splat_cap" not in metrics:
         return
     views = metrics["training_views"]
     enough = metrics["steps"] >= STEPS_PER_VIEW * views and views <= _FEW_VIEWS
@@ -133,11 +134,11 @@ def show_choice(manifest: Manifest) -> None:
     )
 
 
-def show_quality(manifest: Manifest) -> None:
-    """Print PSNR and SSIM of held-out photographs, and what they mean; nothing where the stage
-    has no such metrics."""
-    metrics = manifest.metrics
-    if manifest.stage != "train" or "psnr_db" not in metrics:
+def show_quality(training: Manifest, pruning: Manifest | None = None) -> None:
+    """Print PSNR and SSIM of held-out photographs after training, and what they mean; nothing
+    without such metrics. pruning: the run's, whose change of the mean is printed, too."""
+    metrics = training.metrics
+    if "psnr_db" not in metrics:
         return
     worst = f"worst: {metrics.get('psnr_worst_view')}"
     names = {"mean": "psnr_db", **_SMALLER, worst: "psnr_worst_db"}
@@ -146,6 +147,10 @@ def show_quality(manifest: Manifest) -> None:
         for i, (name, key) in enumerate(names.items())
         if key in metrics
     ]
+    change = pruning.metrics.get("psnr_change_db") if pruning else None
+    if change is not None:
+        pruned = round(metrics["psnr_db"] + change, 2)
+        rows.append(("mean after pruning", console.figure("psnr_db", pruned), ""))
     console.out.print()
     console.table(("held-out photographs", "PSNR", "SSIM"), rows)
     console.out.print(_SCALE)

@@ -20,6 +20,8 @@ from stages.run.stages import STAGE_NAMES
 from stages.viewer.live_training import LiveTraining
 from stages.viewer.server import open_in_browser
 
+_CLUSTER_UNUSED = "cluster-unused"
+
 
 def process(
     photos: Photos = None,
@@ -42,6 +44,11 @@ def process(
     settings = run_settings.requested(pipeline, given, preset)
     if is_known and console.mode.has_notes:
         console.note(run_settings.training_summary(settings["train"], given, preset))
+    if cluster is not None and settings["train"].blocks == "1":
+        console.warn(
+            "Warning: --cluster has no effect: the run trains in one block, on this machine. "
+            f"--blocks auto trains large captures in several. ({_CLUSTER_UNUSED})"
+        )
     _run(pipeline, settings, view=view)
 
 

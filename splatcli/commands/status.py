@@ -57,10 +57,10 @@ def _print(pipeline: Pipeline, steps: list[Step], busy: int | None) -> None:
         ],
         title=str(pipeline.run_folder),
     )
-    for step in steps:
-        if step.manifest and not step.will_run:
-            run_result.show_choice(step.manifest)
-            run_result.show_quality(step.manifest)
+    finished = {s.stage.name: s.manifest for s in steps if s.manifest and not s.will_run}
+    if training := finished.get("train"):
+        run_result.show_choice(training)
+        run_result.show_quality(training, finished.get("prune"))
     if busy:
         console.out.print(f"\nProcess {busy} is working on it now.")
 

@@ -76,6 +76,13 @@ def test_what_blocks_refuse_is_taken_back_as_the_hint_says(
     assert trained_blocks == [2]
 
 
+def test_a_cluster_without_blocks_is_said_to_be_unused(splat) -> None:
+    result = splat("process", "photos", "--cluster", "elsewhere:6379")
+    assert result.exit_code == 0
+    assert "cluster-unused" in result.stderr
+    assert "cluster-unused" not in splat("process", "photos").stderr
+
+
 @pytest.mark.parametrize("corners", ["1 1 -1 -1", "0 0 0 1", "0 1 1 1", "1 0 0 1"])
 def test_a_rectangle_without_an_area_is_refused(splat, corners: str) -> None:
     splat("process", "photos")

@@ -26,11 +26,14 @@ def shown(
     views: int = 21,
     steps: int = 3150,
     run: str = "run",
+    pruning: dict[str, Any] | None = None,
 ) -> str:
-    """The output for a run of `sfm` and `train`, this with `settings`."""
+    """The output for a run of `sfm` and `train`, this with `settings`, and of `prune` with the
+    metrics `pruning`."""
     metrics: dict[str, Any] = {
         "sfm": {"unregistered_images": ["b.jpg"]},
         "train": {"verdict": verdict},
+        **({} if pruning is None else {"prune": pruning}),
     }
     manifests = {
         name: SimpleNamespace(
@@ -102,6 +105,16 @@ def test_psnr_and_ssim_have_a_scale_and_a_page_of_the_guide(
     text = (Path(__file__).parents[2] / file).read_text(encoding="utf-8")
     assert anchor in re.sub(r"[^\w# \n]", "", text.lower()).replace(" ", "-")
     assert max(map(len, quality.splitlines())) <= 80
+
+
+def test_the_mean_after_pruning_is_told_apart_from_that_after_training(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    verdict = {"grade": "good", "text": "Good."}
+    rows = shown(capsys, verdict, pruning={"psnr_change_db": -0.884}).splitlines()
+    assert ["mean", "27.11", "dB", "0.8776"] in [row.split() for row in rows]
+    assert ["mean", "after", "pruning", "26.22", "dB"] in [row.split() for row in rows]
+    assert "after pruning" not in shown(capsys, verdict)
 
 
 @pytest.mark.parametrize("given", [{"steps": 2000}, {"seconds": 60.0}, {"splats": "a.ply"}])
