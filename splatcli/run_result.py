@@ -136,7 +136,7 @@ def show_choice(training: Manifest) -> None:
 
 def show_quality(training: Manifest, pruning: Manifest | None = None) -> None:
     """Print PSNR and SSIM of held-out photographs after training, and what they mean; nothing
-    without such metrics. pruning: the run's, whose change of the mean is printed, too."""
+    without such metrics. pruning: the run's; its change of the mean is printed, too."""
     metrics = training.metrics
     if "psnr_db" not in metrics:
         return

@@ -10,7 +10,7 @@ from stages.scene import Splats
 
 # The viewer holds sizes as 16-bit floats, and this is the smallest that those hold in full.
 SMALLEST = 2.0**-14  # units
-_SHARP = 1e-3  # units; a scene whose median splat is as large shows nothing of the rounding
+_SHARP = 1e-3  # units; with a median splat as large a scene shows nothing of the rounding
 _MOST_TENS = 12  # what would need more are points
 
 
