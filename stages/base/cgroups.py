@@ -52,10 +52,9 @@ def _groups(controller: str, process: Path, mounts: Path) -> Iterator[Path]:
         _, controllers, path = line.split(":", 2)
         if controllers and controller not in controllers.split(","):
             continue
-        inner = PurePosixPath(path).relative_to("/")
-        mounted = controllers, controller if controllers else "unified"
-        for root in (mounts / name for name in mounted):
-            yield from (root / group for group in (inner, *inner.parents))
+        group = PurePosixPath(path).relative_to("/")
+        for name in (controllers, controller) if controllers else ("", "unified"):
+            yield from (mounts / name / inner for inner in (group, *group.parents))
 
 
 def _free_bytes(group: Path) -> float:

@@ -196,7 +196,7 @@ def touched(browser: Browser) -> Iterator[Browser]:
 def fingers(browser: Browser, kind: str, *places: tuple[int, int]) -> None:
     points = [{"x": x, "y": y, "id": number} for number, (x, y) in enumerate(places)]
     browser.call("Input.dispatchTouchEvent", type=kind, touchPoints=points)
-    # Pages are told of motion once a frame.
+    # A page reports motion once a frame.
     frame = "requestAnimationFrame(() => requestAnimationFrame(done))"
     browser.run(f"new Promise(done => {frame})")
 
