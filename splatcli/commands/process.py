@@ -34,7 +34,8 @@ def process(
 
     Finished work is kept: after an interruption the same command goes on where it stopped.
     """
-    from splatcli.distribution import distributed  # loads training, which `--help` does not need
+    # It loads training, which `--help` does not need.
+    from splatcli.distribution import check_blocks, distributed
 
     run_folder, photos = _run_folder_and_photos(photos, out)
     pipeline = distributed(Pipeline(run_folder, photos), cluster)
@@ -42,6 +43,7 @@ def process(
     view, preset = given.pop("view", False), given.pop("preset", None)
     is_known = runfolder.is_run_folder(run_folder)
     settings = run_settings.requested(pipeline, given, preset)
+    check_blocks(settings["train"], cluster if pipeline.manifest("train") is None else None)
     if is_known and console.mode.has_notes:
         console.note(run_settings.training_summary(settings["train"], given, preset))
     if cluster is not None and settings["train"].blocks == "1":

@@ -66,7 +66,7 @@ def in_blocks(pipeline: Pipeline, open_executor: OpenExecutor) -> Pipeline:
         blocks = count_blocks(settings.blocks, views)
         if blocks == 1:
             return stage.run(inputs, single, folder, report)
-        _check(settings)
+        check_settings(settings)
         root = pipeline.run_folder.absolute() / FOLDER
         root.mkdir(exist_ok=True)
         whole = _with_roles(inputs["sfm"])
@@ -337,8 +337,8 @@ def _with_roles(whole: Reconstruction) -> Reconstruction:
     return replace(whole, views=tuple(views))
 
 
-def _check(settings: TrainSettings) -> None:
-    """Raises SplatError for settings that do not go with blocks."""
+def check_settings(settings: TrainSettings) -> None:
+    """Raises SplatError for settings that do not go with several blocks."""
     if not settings.max_splats:
         raise UsageError(
             "blocks-without-cap",

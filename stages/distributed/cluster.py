@@ -197,6 +197,13 @@ def check(workers: Sequence[Worker], ours: str, token: Path | None = None) -> No
             )
 
 
+def check_address(address: str) -> None:
+    """Raises SplatError as `connect`, for what can be known without starting anything: whether Ray
+    is installed, and whether something answers at the address."""
+    _ray()
+    _answers(address)
+
+
 def _ray() -> Any:
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     # A cluster that was started with a token requires it; a client does not send it by default.
@@ -220,14 +227,23 @@ def _start(ray: Any, address: str) -> None:
         store = {"object_store_memory": 100 * _MIB}  # enough for paths and figures
         ray.init(address="local", num_cpus=int(local[1]), **store, **quiet)
         return
+    _answers(address)
+    try:
+        ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+    except (OSError, RuntimeError, ValueError) as error:
+        raise _not_found(address, str(error).strip().splitlines()[0]) from error
+
+
+def _answers(address: str) -> None:
+    """Raises SplatError "cluster-not-found" for no address, and for one where nothing answers."""
+    if _LOCAL.fullmatch(address) or address == "auto":
+        return
     host = _ADDRESS.fullmatch(address)
-    if host is None and address != "auto":
+    if host is None:
         raise _not_found(address, "it is no address")
     try:
-        if host is not None:
-            socket.create_connection((host[1], int(host[2])), _CONNECT_TIMEOUT_S).close()
-        ray.init(address=address, log_to_driver=False, logging_level="ERROR")
-    except (OSError, OverflowError, RuntimeError, ValueError) as error:
+        socket.create_connection((host[1], int(host[2])), _CONNECT_TIMEOUT_S).close()
+    except (OSError, OverflowError, ValueError) as error:
         raise _not_found(address, str(error).strip().splitlines()[0]) from error
 
 

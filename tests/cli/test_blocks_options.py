@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import socket
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,7 +13,7 @@ from typing import Any
 import pytest
 
 from splatcli import input_files, run_settings
-from stages.distributed import blocks
+from stages.distributed import blocks, cluster
 from stages.run import pipeline
 
 BLOCKS = ("run", "--blocks", "2", "--max-splats", "1000")
@@ -81,6 +82,27 @@ def test_a_cluster_without_blocks_is_said_to_be_unused(splat) -> None:
     assert result.exit_code == 0
     assert "cluster-unused" in result.stderr
     assert "cluster-unused" not in splat("process", "photos").stderr
+
+
+def test_what_blocks_refuse_is_refused_before_the_first_stage(splat) -> None:
+    given = ("--blocks", "2", "--max-splats", "1000", "--seconds", "60")
+    result = splat("process", "photos", *given)
+    assert result.exit_code == 2
+    assert "blocks-without-end" in result.stderr
+    assert not Path("run").exists()
+
+
+def test_an_address_where_no_cluster_answers_is_refused_before_the_first_stage(
+    splat, monkeypatch
+) -> None:
+    monkeypatch.setattr(cluster, "_ray", lambda: None)  # as if Ray were installed
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    given = ("--blocks", "2", "--max-splats", "1000", "--cluster", f"127.0.0.1:{port}")
+    result = splat("process", "photos", *given)
+    assert result.exit_code == 2
+    assert "cluster-not-found" in result.stderr
+    assert not Path("run").exists()
 
 
 @pytest.mark.parametrize("corners", ["1 1 -1 -1", "0 0 0 1", "0 1 1 1", "1 0 0 1"])
