@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from splatcli import console, log, options, progress, run_settings
 from splatcli.arguments import Cluster
+from stages.base.errors import SplatError
 from stages.distributed import remote
 from stages.distributed.batch import BatchTable, Row, check_output, run_names
 from stages.distributed.cluster import open_executor
 from stages.distributed.tasks import TaskResult, resources_of, task_for
+from stages.run.pipeline import Pipeline
 
 
 def batch(
@@ -40,25 +44,41 @@ def batch(
     A capture that fails does not stop the others; the exit status is the worst. The same command
     again goes on where it stopped: what is finished is not done twice. batch.csv lists the results.
     """
-    settings = run_settings.of_new_run(options.given_only(given))
-    log.write_settings(settings)
+    given = options.given_only(given)
+    log.write_settings(run_settings.of_new_run(given))  # refuses options before a folder is made
     runs = remote.parse_location(out)
     photos = run_names(remote.expand_locations(captures))
     check_output(runs, [*photos.values()])
-    tasks = [task_for(remote.joined(runs, name), path, settings) for name, path in photos.items()]
     bars = progress.Bars() if console.mode.has_notes and console.err.is_terminal else None
     with (
         remote.prepare_output(runs) as local_folder,
         open_executor(cluster, runs, photos.values(), bars) as executor,
     ):
+        settings = {name: _settings(runs, name, local_folder, given) for name in photos}
+        tasks = [task_for(remote.joined(runs, n), p, settings[n]) for n, p in photos.items()]
         table = BatchTable(local_folder, runs, list(photos))
-        for number, result in executor.results(tasks, resources_of(settings["train"])):
+        need = resources_of(*(of_run["train"] for of_run in settings.values()))
+        for number, result in executor.results(tasks, need):
             table.ended(number, result)
             _report(table.rows[number], result)
         table.write()
     _print(table)
     if table.worst_status:
         raise typer.Exit(table.worst_status)
+
+
+def _settings(
+    runs: remote.Location, name: str, local_folder: Path, given: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Settings by stage name of the run `name`, whose records are copied to `local_folder` from a
+    URL. Raises SplatError."""
+    remote.fetch_records(runs, name, local_folder)
+    others = {key: value for key, value in given.items() if key != "preset"}
+    try:
+        recorded = run_settings.recorded(Pipeline(local_folder / name))
+    except SplatError:  # the run itself will fail by it, and the others go on
+        recorded = run_settings.defaults()
+    return run_settings.combined(recorded, others, given.get("preset"))
 
 
 def _report(row: Row, result: TaskResult) -> None:

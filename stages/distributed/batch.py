@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import astuple, dataclass, fields, replace
@@ -24,7 +25,8 @@ WAITING, DONE = "waiting", "done"
 class Row:
     """A line of batch.csv; figures are "" where they are not known.
 
-    status: "waiting", "done", or the code of the error. seconds: of all stages, whenever they ran.
+    status: "waiting", "done", or the code of the error; beside "waiting", figures are those of
+    earlier calls. seconds: of all stages, whenever they ran.
     psnr_db: of the exported splats on held-out views. size_bytes: of the exported files. warnings:
     their codes.
     """
@@ -65,7 +67,7 @@ def check_output(runs: Location, captures: Sequence[Location]) -> None:
 
 
 class BatchTable:
-    """The results of all runs, kept in batch.csv.
+    """The results of all runs, kept in batch.csv, whose rows of other captures stay.
 
     Args:
         folder: a local folder with the run folders, or with copies of their manifests.
@@ -75,9 +77,21 @@ class BatchTable:
 
     def __init__(self, folder: Path, runs: Location, names: Sequence[str]) -> None:
         self.folder, self.runs = folder, runs
-        self.rows = [Row(name) for name in names]
+        self.rows = [row_of(folder / name) for name in names]
+        self.others = [row for row in self._earlier() if row.capture not in names]
         self.worst_status = 0
         self.write()
+
+    def _earlier(self) -> list[Row]:
+        """The rows of earlier calls; none if batch.csv is missing or damaged."""
+        if isinstance(self.runs, str):
+            with suppress(SplatError):
+                remote.RemoteFolder.at(self.runs).fetch([FILE_NAME], self.folder)
+        try:
+            with (self.folder / FILE_NAME).open(encoding="utf-8", newline="") as file:
+                return [Row(**row) for row in csv.DictReader(file)]
+        except (OSError, ValueError, TypeError, csv.Error):
+            return []
 
     @property
     def location(self) -> Location:
@@ -88,7 +102,7 @@ class BatchTable:
         """Record the result of a run."""
         name = self.rows[number].capture
         with suppress(SplatError):  # the figures stay blank
-            remote.fetch_manifests(self.runs, name, self.folder)
+            remote.fetch_records(self.runs, name, self.folder)
         row = row_of(self.folder / name)
         self.rows[number] = replace(row, status=result.code or DONE)
         self.worst_status = max(self.worst_status, result.status)
@@ -98,7 +112,7 @@ class BatchTable:
     def write(self) -> None:
         """Write batch.csv, whole or not at all. Raises SplatError."""
         names = [field.name for field in fields(Row)]
-        write_csv(self.folder / FILE_NAME, (names, *map(astuple, self.rows)))
+        write_csv(self.folder / FILE_NAME, (names, *map(astuple, (*self.others, *self.rows))))
         if isinstance(self.runs, str):
             remote.RemoteFolder.at(self.runs).put(self.folder, [FILE_NAME])
 

@@ -60,7 +60,7 @@ def capture_name(location: Location) -> str:
         folder = RemoteFolder.at(location)
         path = PurePosixPath(folder.root)
         return path.stem if folder.is_file() else path.name
-    local = location.absolute()
+    local = location.absolute() if location.name not in ("", "..") else location.resolve()
     return local.stem if local.is_file() else local.name
 
 
@@ -93,12 +93,13 @@ def prepare_output(location: Location) -> Iterator[Path]:
             yield location
 
 
-def fetch_manifests(location: Location, name: str, folder: Path) -> None:
-    """Copy the manifests of the run `name` into `folder`, if the location is a URL. Raises
-    SplatError."""
+def fetch_records(location: Location, name: str, folder: Path) -> None:
+    """Copy the settings and the manifests of the run `name` into `folder`, if the location is a
+    URL. Raises SplatError."""
     if isinstance(location, str):
         run = RemoteFolder.at(location) / name
-        run.fetch([file for file in run.names() if file.endswith(f"/{MANIFEST}")], folder / name)
+        wanted = [f for f in run.names() if f == RUN_FILE or f.endswith(f"/{MANIFEST}")]
+        run.fetch(wanted, folder / name)
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ A task holds paths and settings, its result only figures. All data is in run fol
 from __future__ import annotations
 
 import logging
+import math
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -22,6 +23,7 @@ from stages.run.listener import Listener, Listeners
 from stages.run.pipeline import Pipeline
 from stages.run.stages import SHARED_OPTIONS
 from stages.train.cap import needed_mib
+from stages.train.settings import TrainSettings
 
 _log = logging.getLogger(__name__)
 
@@ -84,10 +86,11 @@ class Resources:
     gpus: int = 0
 
 
-def resources_of(train: Any) -> Resources:
-    """The largest resources that a run with these training settings needs."""
-    memory_mib = needed_mib(train.max_splats) if train.max_splats else None
-    return Resources(memory_mib, gpus=int(train.backend == "gpu"))
+def resources_of(*trains: TrainSettings) -> Resources:
+    """The largest resources that runs with these training settings need, each by itself."""
+    most = max(train.max_splats or math.inf for train in trains)
+    memory_mib = needed_mib(int(most)) if math.isfinite(most) else None
+    return Resources(memory_mib, gpus=int(any(train.backend == "gpu" for train in trains)))
 
 
 class Executor(Protocol):

@@ -14,11 +14,14 @@ from threading import Event
 
 import pytest
 
-from stages.base.errors import SplatError
+from splatcli import run_settings
+from stages.base.errors import Interrupted, SplatError
 from stages.distributed import cluster
+from stages.distributed.remote import capture_name
 from stages.distributed.tasks import Resources, RunTask, SerialExecutor
 from stages.run.listener import Listener
 from stages.run.lock import locked
+from stages.run.pipeline import Pipeline
 from tests.cli.pretence import failing_at
 
 NAMES = ("hill", "room", "well")
@@ -64,6 +67,52 @@ def test_formats_that_were_exported_stay(splat, captures) -> None:
     assert splat("batch", captures[0], "--format", "ply").exit_code == 0
     made = json.loads(Path("runs/hill/7-export/manifest.json").read_text())
     assert set(made["settings"]["formats"]) == {"splat", "ply"}
+
+
+def test_options_that_are_not_given_again_stay(splat, captures) -> None:
+    splat("batch", captures[0], "--steps", "12", "--format", "ply")
+    trained = Path("runs/hill/4-train/manifest.json").read_bytes()
+    assert splat("batch", *captures[:2], "--format", "glb").exit_code == 0
+    assert Path("runs/hill/4-train/manifest.json").read_bytes() == trained
+    recorded = {n: run_settings.recorded(Pipeline(Path("runs") / n)) for n in NAMES[:2]}
+    assert recorded["hill"]["train"].steps == 12
+    assert recorded["room"]["train"].steps == 0
+    assert set(recorded["hill"]["export"].formats) == {"ply", "glb"}
+
+
+def test_a_run_with_damaged_settings_does_not_keep_the_others(splat, captures) -> None:
+    splat("batch", captures[0])
+    Path("runs/hill/run.json").write_text("{}")
+    assert splat("batch", *captures[:2]).exit_code != 0
+    assert {name: row["status"] for name, row in rows().items()} == {
+        "hill": "manifest-edited",
+        "room": "done",
+    }
+
+
+def test_rows_of_other_captures_and_earlier_figures_stay(splat, captures, pretend) -> None:
+    splat("batch", *captures[:2])
+    before = rows()
+    stopped = Interrupted("stopped")
+    pretend["ingest"] = failing_at("well", stopped)
+    splat("batch", captures[2], captures[1])
+    assert rows()["hill"] == before["hill"]
+    assert rows()["room"] == {**before["room"], "status": "waiting"}
+    assert rows()["well"]["status"] == "waiting"
+
+
+def test_a_damaged_table_is_made_again(splat, captures) -> None:
+    Path("runs").mkdir()
+    Path("runs/batch.csv").write_bytes(b"\xff\x00capture,other\n1,2,3\n")
+    assert splat("batch", captures[0]).exit_code == 0
+    assert rows()["hill"]["status"] == "done"
+
+
+def test_the_folder_above_is_named_by_its_name(splat, captures, monkeypatch) -> None:
+    monkeypatch.chdir(captures[0])
+    assert capture_name(Path("..")) == "captures"
+    assert capture_name(Path("../..") / "..") == Path.cwd().parents[2].name
+    assert capture_name(Path()) == "hill"
 
 
 def test_a_stop_that_is_given_reaches_each_run(tmp_path: Path) -> None:

@@ -76,6 +76,15 @@ def test_what_is_finished_at_a_url_is_not_done_again(splat, store, pretend) -> N
     assert {path: store.modified(path) for path in before} == before
 
 
+def test_options_and_rows_of_an_earlier_call_stay(splat, store) -> None:
+    batch(splat, "--steps", "12")
+    trained = store.cat("/runs/hill/4-train/manifest.json")
+    result = splat("batch", "memory://captures/hill", "--out", "memory://runs", "--format", "glb")
+    assert result.exit_code == 0, result.output
+    assert store.cat("/runs/hill/4-train/manifest.json") == trained
+    assert set(rows(store)) == set(NAMES)
+
+
 def test_a_stage_of_which_half_is_there_is_done_again(splat, store) -> None:
     batch(splat)
     store.rm_file("/runs/hill/5-prune/manifest.json")
