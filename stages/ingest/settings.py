@@ -66,7 +66,7 @@ class IngestSettings:
 
 STAGE = Stage(
     "ingest",
-    version=19,
+    version=20,
     reads=(),
     settings_type=IngestSettings,
     **in_module("stages.ingest.stage"),

@@ -48,7 +48,7 @@ class Frame:
     def size(self) -> tuple[int, int]:
         """(width, height) upright, in square pixels."""
         width, height = self._stored_size()
-        return (height, width) if self._quarter_turns() % 2 else (width, height)
+        return (height, width) if self._orientation()[0] else (width, height)
 
     def grey(self, longer_side: int) -> NDArray[np.uint8]:
         """[H, W] as stored, not upright, the longer side at most `longer_side` pixels."""
@@ -60,12 +60,28 @@ class Frame:
         """[H, W, 3] upright, the longer side at most `longer_side` pixels."""
         width, height = fitted_size(*self._stored_size(), longer_side)
         pixels = srgb(self.picture, self.colours, width, height)
-        return np.ascontiguousarray(np.rot90(pixels, self._quarter_turns()))
+        transposed, columns_reversed, rows_reversed = self._orientation()
+        if transposed:
+            pixels = pixels.transpose(1, 0, 2)
+        if columns_reversed:
+            pixels = pixels[:, ::-1]
+        if rows_reversed:
+            pixels = pixels[::-1]
+        return np.ascontiguousarray(pixels)
 
-    def _quarter_turns(self) -> int:
-        """Anticlockwise, from the stored to the upright picture."""
-        degrees: int = self.picture.rotation
-        return round(degrees / 90) % 4
+    def _orientation(self) -> tuple[bool, bool, bool]:
+        """Whether rows and columns change places, then whether columns, and rows, are reversed,
+        from the stored to the upright picture.
+
+        The display matrix of the file (ISO/IEC 14496-12, 6.2.2) takes a stored position (p, q) to
+        x = a p + c q and y = b p + d q. It may mirror a picture, which an angle does not say.
+        """
+        for side_data in self.picture.side_data:
+            if side_data.type.name == "DISPLAYMATRIX":
+                a, b, _, c, d = np.frombuffer(bytes(side_data), "<i4")[:5]
+                transposed = abs(b) > abs(a)
+                return transposed, (c if transposed else a) < 0, (b if transposed else d) < 0
+        return False, False, False
 
     def _stored_size(self) -> tuple[int, int]:
         return max(1, round(self.picture.width * self.aspect)), self.picture.height

@@ -98,7 +98,7 @@ class SfmSettings:
 
 STAGE = Stage(
     "sfm",
-    version=29,
+    version=30,
     reads=("ingest",),
     settings_type=SfmSettings,
     **in_module("stages.sfm.stage"),

@@ -91,13 +91,11 @@ def _silence(container: Any, stream: Any) -> None:
     container.mux(stream.encode(None))
 
 
-def turned(path: Path, degrees: int) -> Path:
-    """The same .mp4, to be shown turned clockwise by 90, 180 or 270 degrees (ISO 14496-12)."""
-    cosine, sine = {90: (0, 1), 180: (-1, 0), 270: (0, -1)}[degrees]
+def turned(path: Path, matrix: tuple[int, int, int, int]) -> Path:
+    """The same .mp4 with a, b, c, d of its display matrix (ISO/IEC 14496-12, 6.2.2)."""
+    a, b, c, d = (value << 16 for value in matrix)
     data = bytearray(path.read_bytes())
     start = data.index(b"tkhd") + 4 + (52 if data[data.index(b"tkhd") + 4] else 40)
-    one = 1 << 16
-    matrix = (cosine * one, sine * one, 0, -sine * one, cosine * one, 0, 0, 0, 1 << 30)
-    data[start : start + 36] = struct.pack(">9i", *matrix)
+    data[start : start + 36] = struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30)
     path.write_bytes(bytes(data))
     return path

@@ -121,12 +121,24 @@ def test_a_folder_of_photographs_and_videos_gives_both(video: Path, tmp_path: Pa
     assert [facts["name"] for facts in report.metrics["videos"]] == ["a, b.mp4", "clip.mkv"]
 
 
-@pytest.mark.parametrize(("degrees", "code"), [
-    (90, cv2.ROTATE_90_CLOCKWISE), (180, cv2.ROTATE_180), (270, cv2.ROTATE_90_COUNTERCLOCKWISE),
-])  # fmt: skip
-def test_frames_stand_upright(video: Path, tmp_path: Path, degrees: int, code: int) -> None:
-    capture, _, _ = ingested(turned(video, degrees), tmp_path / "out", frames=4)
-    expected = cv2.rotate(at(PIXELS * numbers(capture)[0]), code)
+MATRICES = {  # what shows a stored picture as it should be
+    (1, 0, 0, 1): lambda stored: stored,
+    (0, 1, -1, 0): lambda stored: cv2.rotate(stored, cv2.ROTATE_90_CLOCKWISE),
+    (-1, 0, 0, -1): lambda stored: cv2.rotate(stored, cv2.ROTATE_180),
+    (0, -1, 1, 0): lambda stored: cv2.rotate(stored, cv2.ROTATE_90_COUNTERCLOCKWISE),
+    (-1, 0, 0, 1): lambda stored: stored[:, ::-1],
+    (1, 0, 0, -1): lambda stored: stored[::-1],
+    (0, 1, 1, 0): lambda stored: stored.transpose(1, 0, 2),
+    (0, -1, -1, 0): lambda stored: stored[::-1, ::-1].transpose(1, 0, 2),
+}
+
+
+@pytest.mark.parametrize("matrix", MATRICES)
+def test_frames_stand_upright(
+    video: Path, tmp_path: Path, matrix: tuple[int, int, int, int]
+) -> None:
+    capture, _, _ = ingested(turned(video, matrix), tmp_path / "out", frames=4)
+    expected = MATRICES[matrix](at(PIXELS * numbers(capture)[0]))
     assert picture(capture, 0).shape == expected.shape
     assert np.abs(picture(capture, 0) - expected).mean() < OTHER / 2
 

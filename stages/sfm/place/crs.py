@@ -19,7 +19,8 @@ from stages.scene.place import (
 )
 from stages.sfm.place.gps import MetricScale, about_vertical
 
-_STEP_M = 50.0  # of the differences that give the axes of the grid
+# Of the differences that give the axes of the grid. Short: a grid is cut at the 180th meridian.
+_STEP_M = 1.0
 # Of lengths in the grid, relative. Zones of UTM and of most countries stretch less than 0.3 %.
 _LARGEST_STRETCH = 0.005
 _UTM_LATITUDES = (-80.0, 84.0)

@@ -130,8 +130,10 @@ class _Fit:
     Args:
         metres: per unit of the old world; 0: there is none.
         turn: [3, 3] from the old to the new world.
-        inliers: [N] positions that agree with the cameras.
+        inliers: [N] positions that were fitted.
         residual_m: RMS distance of these from the cameras.
+        agreeing: how many positions agree with the cameras: these, and others that are no further
+            off than positions may be.
         spatial: how many positions were fitted in three dimensions; 0: in the plane only.
     """
 
@@ -139,22 +141,24 @@ class _Fit:
     turn: NDArray[np.float64]
     inliers: NDArray[np.bool_]
     residual_m: float
+    agreeing: int
     spatial: int = 0
-
-    @property
-    def agreeing(self) -> int:
-        return int(self.inliers.sum())
 
 
 def _flat_fit(here: NDArray[np.float64], there: NDArray[np.float64], levelled: bool) -> _Fit:
     """By horizontal positions. here, there [N, 3]: in the old world; metres east, north and up."""
-    factor, inliers, residual = 0j, np.zeros(len(here), np.bool_), math.inf
+    factor, inliers, residual, agreeing = 0j, np.zeros(len(here), np.bool_), math.inf, 0
     if levelled and len(here) >= _FEWEST:
         flat_here, flat_there = here[:, 0] + 1j * here[:, 2], there[:, 0] + 1j * there[:, 1]
         factor, inliers, residual = fit_similarity_2d(flat_here, flat_there)
+        if factor:
+            moved = factor * (flat_here - flat_here[inliers].mean())
+            off = np.abs(flat_there - flat_there[inliers].mean() - moved)
+            spread = float(np.sqrt(np.mean(np.abs(moved) ** 2)))
+            agreeing = int((inliers | (off <= _WORST_RESIDUAL * spread)).sum())
     # (x + iz) e^(i angle) rotates x towards z; `about_vertical` rotates the other way.
     turn = about_vertical(-float(np.angle(factor)))
-    return _Fit(float(abs(factor)), turn, inliers, residual)
+    return _Fit(float(abs(factor)), turn, inliers, residual, agreeing)
 
 
 def _free_fit(
@@ -164,7 +168,8 @@ def _free_fit(
     found = _fit_3d(here[exact], there[exact], None, any_tilt=True)
     if found is None:
         return None
-    return _Fit(*found, exact, _off(here[exact], there[exact], *found), int(exact.sum()))
+    off, count = _off(here[exact], there[exact], *found), int(exact.sum())
+    return _Fit(*found, exact, off, count, spatial=count)
 
 
 def _tilted(
@@ -328,7 +333,10 @@ def fit_similarity_2d(
             best, least, anchor = factor, off, i
     if not math.isfinite(least):
         return 0j, np.zeros(len(here), np.bool_), math.inf
-    inliers = np.abs(there - there[anchor] - best * (here - here[anchor])) <= 3.0 * least + _EXACT_M
+    # Two of the distances are 0, so with few points the median is too small (Rousseeuw and Leroy
+    # 1987, chapter 5).
+    reach = 3.0 * (1.0 + 5.0 / max(len(here) - 2, 1)) * least + _EXACT_M
+    inliers = np.abs(there - there[anchor] - best * (here - here[anchor])) <= reach
     a, b = here[inliers] - here[inliers].mean(), there[inliers] - there[inliers].mean()
     factor = complex((a.conj() @ b) / max(float((a.conj() @ a).real), 1e-300))
     return factor, inliers, float(np.sqrt(np.mean(np.abs(b - factor * a) ** 2)))

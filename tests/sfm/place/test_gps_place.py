@@ -218,6 +218,15 @@ def test_a_grid_that_is_a_mirror_image_is_refused() -> None:
     assert np.linalg.det(in_crs(prague, "EPSG:5514", Report()).axes) == pytest.approx(1, abs=0.01)
 
 
+@pytest.mark.parametrize("longitude", [179.9998, -179.9998])
+def test_a_grid_is_used_beside_its_cut(longitude: float) -> None:
+    """21 m from the 180th meridian, in Fiji, where EPSG:3857 goes from one end to the other."""
+    fiji = EarthPlace(GEOGRAPHIC, np.array([-16.8, longitude, 5.0]), np.eye(3))
+    axes = in_crs(fiji, "EPSG:3857", Report()).axes
+    stretch = 1 / np.cos(np.radians(16.8))
+    assert axes[:2, :2] == pytest.approx(stretch * np.eye(2), abs=0.01)
+
+
 @pytest.mark.parametrize(("crs", "at"), [("EPSG:3857", (48, 11, 0)), ("EPSG:3031", (-75, 30, 0))])
 def test_grids_of_all_longitudes_have_no_outside_there(crs: str, at: tuple[int, ...]) -> None:
     pytest.importorskip("pyproj")

@@ -134,6 +134,31 @@ def test_gps_with_noise_and_wild_fixes_is_used_with_its_residual() -> None:
     assert 28 <= report.metrics["gps_agreeing"] <= 33
 
 
+@pytest.mark.parametrize("count", [5, 6, 7, 8])
+def test_few_positions_that_agree_are_used(count: int) -> None:
+    """Two of them fit exactly, whichever two the hypothesis takes."""
+    poses = cameras(count)
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        measured = true_east_north(poses) * 3.0 + rng.normal(0, 0.02, (count, 2))
+        metric, report = found(capture_of(on_earth(measured)), poses)
+        assert metric is not None
+        assert metric.metres == pytest.approx(3.0 * METRES, rel=0.02)
+        assert report.metrics["gps_agreeing"] == count
+
+
+def test_positions_off_by_less_than_allowed_agree_and_do_not_bend_the_scale() -> None:
+    """As of positions to the centimetre, of which some were taken before the receiver was."""
+    poses = cameras(12)
+    measured = 100.0 * true_east_north(poses)
+    spread = np.sqrt(np.mean(np.sum((measured - measured.mean(axis=0)) ** 2, axis=1)))
+    measured[:3] += 0.1 * spread * np.array([[1, 0], [0, -1], [-1, 0]])
+    metric, report = found(capture_of(on_earth(measured)), poses)
+    assert metric is not None
+    assert metric.metres == pytest.approx(100.0 * METRES, rel=1e-3)
+    assert report.metrics["gps_agreeing"] == 12
+
+
 def test_gps_that_does_not_fit_is_refused() -> None:
     """As of a table-top scene: the receiver strays farther than the photographer walked."""
     rng = np.random.default_rng(3)
