@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from stages.base.atomic import write_csv
 from stages.base.errors import UsageError
 from stages.base.text import counted
@@ -17,7 +19,14 @@ from stages.evaluate.evaluation import (
     image_renderer,
     load_evaluation_views,
 )
-from stages.scene import Reconstruction, Splats, View, evenly_spaced, split_held_out
+from stages.scene import (
+    TRANSPARENT,
+    Reconstruction,
+    Splats,
+    View,
+    evenly_spaced,
+    split_held_out,
+)
 from stages.tradeoff import html
 from stages.tradeoff.curves import change_of, mean_db
 from stages.tradeoff.intervals import (
@@ -123,12 +132,22 @@ def _on_common_pixels(
     """The views `names` of both, compared where both masks are valid: the run with the smaller ones
     would be better because they leave out what is hard to draw. Views without a compared pixel at
     some of `SIZES` are left out."""
-    first, second = (one.views(names, side_px) for one in both)
-    pairs = (
-        (a.compared_within(b.valid), b.compared_within(a.valid))
-        for a, b in zip(first, second, strict=True)
-    )
+    views = (one.views(names, side_px) for one in both)
+    pairs = (_on_pixels_of_both(a, b) for a, b in zip(*views, strict=True))
     return [pair for pair in pairs if all(map(_counts_at_every_size, pair))]
+
+
+def _on_pixels_of_both(
+    first: EvaluationView, second: EvaluationView
+) -> tuple[EvaluationView, EvaluationView]:
+    """The views of one photograph, compared where both masks are valid. Where the photograph is not
+    cut out alike in both, transparent pixels are not compared: each would have another truth."""
+    a, b = first, second
+    cut_out = TRANSPARENT in (a.outside, b.outside) and not np.array_equal(a.pixels, b.pixels)
+    if cut_out:
+        a, b = a.compared_where_solid(), b.compared_where_solid()
+    a, b = a.compared_within(b.valid), b.compared_within(a.valid)
+    return (a.black_where_not_compared(), b.black_where_not_compared()) if cut_out else (a, b)
 
 
 def _counts_at_every_size(view: EvaluationView) -> bool:
