@@ -329,6 +329,36 @@ def test_what_two_cut_outs_draw_outside_their_equal_masks_counts(scene) -> None:
     assert found.psnr.verdict == BETTER
 
 
+def evened(scene, candidate: Candidate, light: bool) -> Candidate:
+    """A run whose photographs differ in exposure, and whether it corrects that."""
+    views = tuple(
+        replace(view, light=(ev, ev, ev))
+        for view, ev in zip(
+            scene.reconstruction.views, np.resize([0.7, -0.7, 0.4], 10), strict=True
+        )
+    )
+    settings = replace(candidate.splats.draw_settings, light=light)
+    return replace(
+        candidate,
+        splats=replace(candidate.splats, draw_settings=settings),
+        reconstruction=replace(scene.reconstruction, views=views),
+    )
+
+
+def test_runs_are_compared_in_one_light(scene) -> None:
+    runs = [evened(scene, side(scene, f"light {on}"), on) for on in (True, False)]
+    taken = evened(scene, side(scene, "taken"), False).views(["00.png"], 72, light=False)
+    for pair in (runs, runs[::-1]):
+        found = compare_runs(*pair)
+        assert (found.psnr.mean, found.ssim.mean) == (0, 0)
+        for views in found.views:
+            np.testing.assert_array_equal(views[0].pixels, taken[0].pixels)
+        assert any(line.startswith("Only light True was") for line in verdict_lines(found))
+    both = compare_runs(runs[0], runs[0])
+    assert (both.views[0][0].pixels != taken[0].pixels).any()
+    assert not any("as they were taken" in line for line in verdict_lines(both))
+
+
 def held_out_masked(scene, candidate: Candidate, names: list[str], mask: np.ndarray) -> Candidate:
     """A run in which views of these names ignore what is outside `mask`."""
     reconstruction = scene.reconstruction
