@@ -87,6 +87,18 @@ class EvaluationView:
         outside = np.asarray(scaled_image((~valid).astype(np.float32), width, height) > 0)
         return replace(self, excluded=outside if self.excluded is None else self.excluded | outside)
 
+    def compared_where_solid(self) -> EvaluationView:
+        """The same, where no pixel is compared that is transparent, wholly or in part."""
+        if self.mask is None or self.outside != TRANSPARENT:
+            return self
+        return self.compared_within(self.mask == 255)
+
+    def black_where_not_compared(self) -> EvaluationView:
+        """The same, black where no pixel is compared: windows of SSIM reach over such pixels."""
+        if (valid := self.valid) is None:
+            return self
+        return replace(self, pixels=np.where(valid[..., None], self.pixels, np.uint8(0)))
+
     def scaled(self, scale: float) -> EvaluationView:
         """At `scale` (at most 1) times the size along each side, by area averaging as in
         `scene.pictures`. A pixel is compared if all pixels that it averages are."""

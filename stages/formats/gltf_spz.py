@@ -29,6 +29,11 @@ _NOT_DESCRIBED = (f"{EXTENSION}:OPACITY", f"{EXTENSION}:SH_DEGREE_0_COEF_0")
 def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
     """Write `splats`, rounded as `spz.write` does. Raises SplatError when the file cannot be
     written or would pass 4 GiB."""
+    write_rounded(path, splats, units=units)
+
+
+def write_rounded(path: Path, splats: Splats, *, units: str = "arbitrary") -> Splats:
+    """Write `splats` as `write` does. Returns them as the file holds them: rounded, y down."""
     packed = io.BytesIO()
     spz.pack(packed, splats)
     payload = np.frombuffer(packed.getvalue(), np.uint8)
@@ -38,3 +43,4 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
         del described[name]
     primitives = [described] if len(splats) else []
     write_file(Path(path), primitives, splats, units, payload=payload)
+    return held

@@ -235,15 +235,16 @@ def _write_chunk(folder: Path, splats: Splats, units: str) -> None:
 def _described(part: _Tree, levels: Sequence[Splats]) -> dict[str, Any]:
     """The tree for lod-meta.json, with the bounding box of the ellipsoids of each node."""
     if isinstance(part, _Leaf):
-        boxes = [bounding_box(levels[i], rows) for i, rows in enumerate(part.rows) if len(rows)]
+        boxes = [_bounding_box(levels[i], rows) for i, rows in enumerate(part.rows) if len(rows)]
         return {"bound": _around(boxes), "lods": part.lods}
     children = [_described(side, levels) for side in part]
     ends = [(c["bound"]["min"], c["bound"]["max"]) for c in children]
     return {"bound": _around(ends), "children": children}
 
 
-def bounding_box(splats: Splats, rows: _Rows) -> tuple[list[float], list[float]]:
-    """(low, high) of the ellipsoids of some rows."""
+def _bounding_box(splats: Splats, rows: _Rows) -> tuple[list[float], list[float]]:
+    """(low, high) of the ellipsoids of some rows, one standard deviation along each axis: the
+    boxes that splat-transform writes (its write-lod.ts)."""
     lows, highs = [], []
     for part in row_slices(len(rows)):
         some = rows[part]

@@ -28,10 +28,12 @@ from stages.formats import gltf_read, gltf_spz
 from stages.formats.earth_fixed import earth_from_place
 from stages.formats.gltf_file import EXTENSION, SPZ_EXTENSION
 from stages.formats.json_fields import agreed, located, location_fields
-from stages.formats.streamed_sog import beside, bounding_box, level_widths
+from stages.formats.streamed_sog import beside, level_widths
 from stages.formats.values import concatenate
+from stages.raster.definition import ALPHA_MIN
 from stages.scene import Splats
 from stages.scene.flip import flipped
+from stages.scene.rotations import matrices_of
 
 # Viewers refine a tile whose geometric error is wider than 16 pixels, if nobody sets another
 # number. Here that is where its splats are wider than 4: CesiumJS does not widen splats, leaves out
@@ -43,6 +45,7 @@ _META_LIMIT_BYTES = 1 << 26
 TILE_SPLATS, _DEEPEST = 20_000, 32  # of a tile, about; of the tree
 _FOLDER, _TILE = "tiles_0", re.compile(r"(tiles_[0-9]+)/[0-9]+_[0-9]+\.glb")
 _Rows = NDArray[np.intp]
+_Ends = tuple[NDArray[np.float64], NDArray[np.float64]]  # (low, high) of a box along the axes
 
 
 @dataclass(frozen=True)
@@ -77,15 +80,18 @@ def write(
     """
     levels = [splats, *coarser]
     root = _divided(levels)
-    content = _described(levels, root, units)
+    transform = _transform(splats)
     make_folder(path.parent)
     with temporary_beside(path) as asset:
+        boxes: dict[str, _Ends] = {}
         for tile in _every(root):
             if len(tile.rows):
                 make_folder(asset.parent / _FOLDER)
                 held = levels[tile.level].take(tile.rows)
                 held = replace(held, origin=np.zeros(3), place=None, first_camera=None)
-                gltf_spz.write(asset.parent / tile.name, held, units=units)
+                rounded = gltf_spz.write_rounded(asset.parent / tile.name, held, units=units)
+                boxes[tile.name] = _drawn_box(rounded)
+        content = _described(levels, root, boxes, transform, units)
         asset.write_text(json.dumps(content, allow_nan=False), encoding="utf-8")
         move(asset, path)
 
@@ -161,8 +167,15 @@ def _every(tile: _Tile) -> Iterator[_Tile]:
         yield from _every(child)
 
 
-def _described(levels: Sequence[Splats], root: _Tile, units: str) -> dict[str, Any]:
-    """The content of tileset.json."""
+def _described(
+    levels: Sequence[Splats],
+    root: _Tile,
+    boxes: dict[str, _Ends],
+    transform: NDArray[np.float64] | None,
+    units: str,
+) -> dict[str, Any]:
+    """The content of tileset.json. boxes: of the contents of tiles, by name. transform: of the
+    root."""
     finest = levels[0]
     said = flipped(finest.take(slice(0)))
     extensions = [EXTENSION, SPZ_EXTENSION]
@@ -171,8 +184,8 @@ def _described(levels: Sequence[Splats], root: _Tile, units: str) -> dict[str, A
     # so that a viewer leaves the scene out where it is smaller than a pixel
     sides = np.ptp(finest.means.astype(np.float64), axis=0) if len(finest) else np.zeros(3)
     whole = max(_USUAL_PIXELS * float(np.linalg.norm(sides)), *errors)
-    described = _described_tile(levels, root, errors, whole) | {"refine": "REPLACE"}
-    if (transform := _transform(finest)) is not None:
+    described = _described_tile(root, boxes, errors, whole) | {"refine": "REPLACE"}
+    if transform is not None:
         described["transform"] = transform.T.ravel().tolist()
     return {
         "asset": {
@@ -193,15 +206,14 @@ def _described(levels: Sequence[Splats], root: _Tile, units: str) -> dict[str, A
 
 
 def _described_tile(
-    levels: Sequence[Splats], tile: _Tile, errors: Sequence[float], above: float
+    tile: _Tile, boxes: dict[str, _Ends], errors: Sequence[float], above: float
 ) -> dict[str, Any]:
     """errors: of the levels. above: that of the tile that this one replaces."""
     error = 0.0 if not tile.children else errors[tile.level] if len(tile.rows) else above
-    children = [_described_tile(levels, child, errors, error) for child in tile.children]
+    children = [_described_tile(child, boxes, errors, error) for child in tile.children]
     ends = [_ends(child["boundingVolume"]["box"]) for child in children]
     if len(tile.rows):
-        box = np.array(bounding_box(levels[tile.level], tile.rows)) @ _FROM_OURS.T
-        ends.append((box.min(axis=0), box.max(axis=0)))
+        ends.append(boxes[tile.name])
     low = np.min([end[0] for end in ends], axis=0) if ends else np.zeros(3)
     high = np.max([end[1] for end in ends], axis=0) if ends else np.zeros(3)
     sides = np.diag((high - low) / 2)
@@ -216,7 +228,19 @@ def _described_tile(
     return described
 
 
-def _ends(box: Sequence[float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _drawn_box(held: Splats) -> _Ends:
+    """Around what is drawn of the splats of a tile: each to where its alpha is `ALPHA_MIN`.
+    A bounding volume encloses its content (OGC 22-025r4, 3D Tiles 1.1)."""
+    axes = matrices_of(held.quaternions) * np.exp(held.log_scales.astype(np.float64))[:, None, :]
+    deviations = np.linalg.norm(axes, axis=2)
+    fades = np.maximum(held.opacities.astype(np.float64) / ALPHA_MIN, 1)  # until it is not drawn
+    reach = deviations * np.sqrt(2 * np.log(fades))[:, None]
+    ends = [(held.means - reach).min(axis=0), (held.means + reach).max(axis=0)]
+    box = np.array(ends) @ _FROM_OURS.T
+    return box.min(axis=0), box.max(axis=0)
+
+
+def _ends(box: Sequence[float]) -> _Ends:
     """(low, high) of a box along the axes."""
     middle, half = np.array(box[:3]), np.diag(np.reshape(box[3:], (3, 3)))
     return middle - half, middle + half

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from stages.base.atomic import write_csv
 from stages.base.errors import UsageError
 from stages.base.text import counted
@@ -17,7 +19,14 @@ from stages.evaluate.evaluation import (
     image_renderer,
     load_evaluation_views,
 )
-from stages.scene import Reconstruction, Splats, View, evenly_spaced, split_held_out
+from stages.scene import (
+    TRANSPARENT,
+    Reconstruction,
+    Splats,
+    View,
+    evenly_spaced,
+    split_held_out,
+)
 from stages.tradeoff import html
 from stages.tradeoff.curves import change_of, mean_db
 from stages.tradeoff.intervals import (
@@ -48,9 +57,15 @@ class Candidate:
         camera = self.splats.draw_settings.camera(self.split[1][name].camera)
         return max(camera.width, camera.height)
 
-    def views(self, names: Sequence[str], side_px: int) -> tuple[EvaluationView, ...]:
-        """The views `names` with this run's cameras. Raises SplatError."""
-        settings = replace(self.splats.draw_settings, side=side_px)
+    @property
+    def corrects_light(self) -> bool:
+        """Whether this run was trained on photographs brought to their median light."""
+        return self.splats.draw_settings.light
+
+    def views(self, names: Sequence[str], side_px: int, light: bool) -> tuple[EvaluationView, ...]:
+        """The views `names` with this run's cameras. light: whether their photographs are brought
+        to their median light. Raises SplatError."""
+        settings = replace(self.splats.draw_settings, side=side_px, light=light)
         by_name = {view.name: view for view in self.reconstruction.views}
         chosen = [by_name[name] for name in names]
         return tuple(load_evaluation_views(self.reconstruction.folder, chosen, settings))
@@ -121,14 +136,26 @@ def _on_common_pixels(
     both: tuple[Candidate, Candidate], names: Sequence[str], side_px: int
 ) -> list[tuple[EvaluationView, EvaluationView]]:
     """The views `names` of both, compared where both masks are valid: the run with the smaller ones
-    would be better because they leave out what is hard to draw. Views without a compared pixel at
-    some of `SIZES` are left out."""
-    first, second = (one.views(names, side_px) for one in both)
-    pairs = (
-        (a.compared_within(b.valid), b.compared_within(a.valid))
-        for a, b in zip(first, second, strict=True)
-    )
+    would be better because they leave out what is hard to draw. Photographs are as they were taken
+    unless both runs correct their light. Views without a compared pixel at some of `SIZES` are left
+    out."""
+    light = all(one.corrects_light for one in both)
+    views = (one.views(names, side_px, light) for one in both)
+    pairs = (_on_pixels_of_both(a, b) for a, b in zip(*views, strict=True))
     return [pair for pair in pairs if all(map(_counts_at_every_size, pair))]
+
+
+def _on_pixels_of_both(
+    first: EvaluationView, second: EvaluationView
+) -> tuple[EvaluationView, EvaluationView]:
+    """The views of one photograph, compared where both masks are valid. Where the photograph is not
+    cut out alike in both, transparent pixels are not compared: each would have another truth."""
+    a, b = first, second
+    cut_out = TRANSPARENT in (a.outside, b.outside) and not np.array_equal(a.pixels, b.pixels)
+    if cut_out:
+        a, b = a.compared_where_solid(), b.compared_where_solid()
+    a, b = a.compared_within(b.valid), b.compared_within(a.valid)
+    return (a.black_where_not_compared(), b.black_where_not_compared()) if cut_out else (a, b)
 
 
 def _counts_at_every_size(view: EvaluationView) -> bool:
@@ -155,9 +182,20 @@ def verdict_lines(comparison: Comparison) -> list[str]:
             for size in ("half", "quarter")
         ),
         f"SSIM: {_in_words(comparison.ssim, 4)}",
+        *_about_light(a, b),
         f"Measured on {counted(change.views, 'held-out view')}, {comparison.side_px} pixels large. "
         "Each is one run: the interval does not say whether the same settings would be better with "
         "another seed.",
+    ]
+
+
+def _about_light(first: Candidate, second: Candidate) -> list[str]:
+    if first.corrects_light == second.corrects_light:
+        return []
+    one = first if first.corrects_light else second
+    return [
+        f"Only {one.name} was trained on photographs brought to one exposure and white balance. "
+        "Both are compared with the photographs as they were taken."
     ]
 
 

@@ -19,13 +19,14 @@ from stages.base.errors import SplatError
 from stages.editing import levels
 from stages.formats import tileset
 from stages.proof.checks import read_back
+from stages.proof.independent_readers import gltf
 from stages.proof.losses import losses_of
 from stages.proof.prover import Prover, cameras_for
 from stages.scene import Splats
 from stages.scene.place import EAST_DOWN_NORTH, GEOGRAPHIC, EarthPlace, geodetic
 from tests import scenes
 from tests.formats.files import glb_parts
-from tests.formats.truth import many_splats
+from tests.formats.truth import covariance, many_splats
 
 MUNICH = EarthPlace(GEOGRAPHIC, np.array([48.1, 11.5, 520.0]), EAST_DOWN_NORTH * 2.0)
 MUNICH_UTM = EarthPlace("EPSG:25832", np.array([691607.0, 5334760.0, 520.0]), EAST_DOWN_NORTH * 2.0)
@@ -119,6 +120,42 @@ def test_tiles_hold_levels_and_replace_one_another(asset: Path) -> None:
         assert children or tile["geometricError"] == 0
     assert counts == {0: 125, 1: 500, 2: 2000}
     assert meta["geometricError"] > meta["root"]["geometricError"]
+
+
+def drawn_ends(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """[N, 3] low and high of the splats of a tile, z up, each to where its alpha is 1/255."""
+    splats = gltf(path)
+    covariances = [
+        covariance(q, np.exp(s))
+        for q, s in zip(splats.quaternions, splats.log_scales.astype(np.float64), strict=True)
+    ]
+    deviations = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    reach = deviations * np.sqrt(2 * np.log(np.maximum(255 * splats.opacities, 1)))[:, None]
+    reach, (x, y, z) = reach[:, [0, 2, 1]], splats.means.T
+    middle = np.stack([x, -z, y], axis=1)
+    return middle - reach, middle + reach
+
+
+def test_boxes_hold_their_splats_to_where_they_are_not_drawn(tmp_path: Path) -> None:
+    splats = splats_at(None)
+    splats.log_scales[7] = np.log([3.0, 0.1, 0.1])
+    splats.quaternions[7] = np.array([0.5, -1.0, 0.3, 2.0])
+    splats.opacity_logits[7] = 8.0
+    path = tmp_path / "tileset.json"
+    levels.write(path, splats)
+
+    def check(tile: dict[str, Any], above: list[tuple[np.ndarray, np.ndarray]]) -> None:
+        boxes = [*above, ends(tile)]
+        low, high = drawn_ends(path.parent / tile["content"]["uri"])
+        for box in boxes:
+            assert (low >= box[0] - 1e-4).all()
+            assert (high <= box[1] + 1e-4).all()
+        if not tile.get("children"):  # and not much more
+            np.testing.assert_allclose([low.min(axis=0), high.max(axis=0)], boxes[-1], atol=1e-4)
+        for child in tile.get("children", ()):
+            check(child, boxes)
+
+    check(json.loads(path.read_text())["root"], [])
 
 
 def test_without_levels_the_inner_tiles_hold_nothing(tmp_path: Path) -> None:

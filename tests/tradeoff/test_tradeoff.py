@@ -18,6 +18,7 @@ from stages.prune.settings import PruneSettings
 from stages.prune.stage import pruner_of
 from stages.scene import (
     IGNORE,
+    TRANSPARENT,
     DrawSettings,
     QuantisedSplats,
     TrainedSplats,
@@ -256,30 +257,106 @@ def test_a_comparison_says_which_run_is_better_at_each_size(scene) -> None:
     ]
 
 
-def masked(scene, candidate: Candidate, name: str, mask: np.ndarray) -> Candidate:
-    """A run whose views ignore what is outside `mask`, a file of this name."""
+MIDDLE = np.zeros((54, 72), bool)
+MIDDLE[10:44, 16:56] = True
+
+
+def masked(
+    scene, candidate: Candidate, name: str, mask: np.ndarray, outside: str = IGNORE
+) -> Candidate:
+    """A run whose views have `mask`, a file of this name; outside it they have what `outside`
+    says."""
     reconstruction = scene.reconstruction
     Image.fromarray(np.where(mask, 255, 0).astype(np.uint8)).save(reconstruction.folder / name)
-    views = (replace(view, mask=name, outside=IGNORE) for view in reconstruction.views)
+    views = (replace(view, mask=name, outside=outside) for view in reconstruction.views)
     return replace(candidate, reconstruction=replace(reconstruction, views=tuple(views)))
 
 
 def test_a_run_is_not_better_for_ignoring_what_it_draws_wrong(scene) -> None:
-    middle = np.zeros((54, 72), bool)
-    middle[10:44, 16:56] = True
     inside = (np.abs(scene.splats.means) < 0.35).all(1)
     sh = scene.splats.sh.copy()
     sh[inside] += np.float32(0.3)
     wrong = side(scene, "wrong", replace(scene.splats, sh=sh))
     brighter = replace(scene.splats, sh=scene.splats.sh + np.float32(0.02))
-    first, second = side(scene, "first", brighter), masked(scene, wrong, "outer.png", ~middle)
+    first, second = side(scene, "first", brighter), masked(scene, wrong, "outer.png", ~MIDDLE)
     found = compare_runs(first, second)
-    equal = compare_runs(masked(scene, first, "outer.png", ~middle), second)
+    equal = compare_runs(masked(scene, first, "outer.png", ~MIDDLE), second)
     assert found.psnr == equal.psnr
     assert {size: d.mean for size, d in found.psnr_by_size.items()} == {
         size: d.mean for size, d in equal.psnr_by_size.items()
     }
     assert found.ssim == equal.ssim
+
+
+def test_what_one_run_cuts_out_of_its_photographs_is_not_compared(scene) -> None:
+    brighter = replace(scene.splats, sh=scene.splats.sh + np.float32(0.02))
+    whole, same = side(scene, "whole"), side(scene, "same")
+    cut_out = masked(scene, same, "middle.png", MIDDLE, TRANSPARENT)
+    for pair in ((whole, cut_out), (cut_out, whole)):
+        found = compare_runs(*pair)
+        assert {change.mean for change in found.psnr_by_size.values()} == {0}
+        assert found.ssim.mean == 0
+    other = side(scene, "other", brighter)
+    ignoring, cutting = (
+        compare_runs(whole, masked(scene, other, "middle.png", MIDDLE, outside))
+        for outside in (IGNORE, TRANSPARENT)
+    )
+    assert cutting.psnr == ignoring.psnr
+    assert cutting.psnr.verdict == WORSE
+
+
+def test_two_cut_outs_by_other_masks_are_compared_where_both_are_solid(scene) -> None:
+    small = np.zeros_like(MIDDLE)
+    small[16:38, 24:48] = True
+    first, second = (
+        masked(scene, side(scene, "a"), f"{name}.png", mask, TRANSPARENT)
+        for name, mask in (("middle", MIDDLE), ("small", small))
+    )
+    found = compare_runs(first, second)
+    assert (found.psnr.mean, found.ssim.mean) == (0, 0)
+    for view in (*found.views[0], *found.views[1]):
+        assert view.valid is not None
+        np.testing.assert_array_equal(view.valid, small)
+
+
+def test_what_two_cut_outs_draw_outside_their_equal_masks_counts(scene) -> None:
+    fewer = side(scene, "fewer", scene.splats.take(np.abs(scene.splats.means).max(1) < 0.5))
+    first, second = (
+        masked(scene, one, "middle.png", MIDDLE, TRANSPARENT) for one in (side(scene, "all"), fewer)
+    )
+    found = compare_runs(first, second)
+    assert all(view.valid is None for views in found.views for view in views)
+    assert found.psnr.verdict == BETTER
+
+
+def evened(scene, candidate: Candidate, light: bool) -> Candidate:
+    """A run whose photographs differ in exposure, and whether it corrects that."""
+    views = tuple(
+        replace(view, light=(ev, ev, ev))
+        for view, ev in zip(
+            scene.reconstruction.views, np.resize([0.7, -0.7, 0.4], 10), strict=True
+        )
+    )
+    settings = replace(candidate.splats.draw_settings, light=light)
+    return replace(
+        candidate,
+        splats=replace(candidate.splats, draw_settings=settings),
+        reconstruction=replace(scene.reconstruction, views=views),
+    )
+
+
+def test_runs_are_compared_in_one_light(scene) -> None:
+    runs = [evened(scene, side(scene, f"light {on}"), on) for on in (True, False)]
+    taken = evened(scene, side(scene, "taken"), False).views(["00.png"], 72, light=False)
+    for pair in (runs, runs[::-1]):
+        found = compare_runs(*pair)
+        assert (found.psnr.mean, found.ssim.mean) == (0, 0)
+        for views in found.views:
+            np.testing.assert_array_equal(views[0].pixels, taken[0].pixels)
+        assert any(line.startswith("Only light True was") for line in verdict_lines(found))
+    both = compare_runs(runs[0], runs[0])
+    assert (both.views[0][0].pixels != taken[0].pixels).any()
+    assert not any("as they were taken" in line for line in verdict_lines(both))
 
 
 def held_out_masked(scene, candidate: Candidate, names: list[str], mask: np.ndarray) -> Candidate:
