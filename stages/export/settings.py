@@ -45,7 +45,7 @@ class ExportSettings:
 
 STAGE = Stage(
     "export",
-    version=16,
+    version=17,
     reads=("sfm", "quantise"),
     settings_type=ExportSettings,
     adds="formats",
