@@ -18,7 +18,7 @@ from stages.evaluate.evaluation import load_evaluation_views
 from stages.prune.stage import pruner_of
 from stages.run import results
 from stages.run.pipeline import Pipeline
-from stages.scene import Splats, evenly_spaced, split_held_out
+from stages.scene import Splats, evenly_spaced, split_held_out, why_none_is_held_out
 from stages.tradeoff.intervals import TRAINING_VIEWS
 from stages.tradeoff.measurement import TradeoffInputs, measure_tradeoff
 from stages.tradeoff.report import summarise, write_report
@@ -76,8 +76,9 @@ def _inputs(pipeline: Pipeline) -> TradeoffInputs:
     training, held = split_held_out(reconstruction.views)
     if not held:
         raise _nothing_held_out(
-            f"{pipeline.run_folder} has no held-out view: there are too few photographs.",
-            "Take more photographs: at least four; one of every eight is held out.",
+            f"{pipeline.run_folder} has no held-out view: "
+            f"{why_none_is_held_out(reconstruction.views)}.",
+            "Use a run of four photographs or more, without --no-hold-out.",
         )
     held_out = load_evaluation_views(reconstruction.folder, held, settings)
     if not any(view.counts for view in held_out):

@@ -25,6 +25,15 @@ def disk_full(doing: str, folder: Path) -> SplatError:
     )
 
 
+def link_or_copy(file: str, target: str) -> None:
+    """Make `target` a link to the file, which no one may write into from then on, or a copy where
+    the disk has no links. Raises OSError."""
+    try:
+        os.link(file, target)
+    except OSError:
+        shutil.copy2(file, target)
+
+
 def is_full(place: Path) -> bool:
     """Whether the disk of `place`, or of its nearest parent that exists, has less than 4 MiB left.
 

@@ -106,8 +106,9 @@ class Stage:
     run(inputs, settings, folder, report): writes everything under `folder` and returns the output.
         `folder` may hold what an interrupted run of the same inputs and settings left there.
     load(folder): the output again, from a finished folder. Cheap: arrays may be loaded, images not.
-    adds: a setting whose items are made apart from each other: `run` may take those that its
-        earlier output has from `Report.earlier`, if its own output has the same bytes.
+    adds: a setting on which little depends, or whose items are made apart from each other: `run`
+        may take the rest, or the items, from `Report.earlier`, if its own output has the same
+        bytes.
     """
 
     name: str

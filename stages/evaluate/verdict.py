@@ -112,10 +112,11 @@ def fits(splats: Splats, views: Sequence[EvaluationView], backend: str) -> list[
     return [one.fit(far) for one in drawn]
 
 
-def verdict(held_out: Sequence[Fit], training: Sequence[Fit]) -> Verdict:
-    """The verdict on a result, from fits of `held_out` and of some `training` views."""
+def verdict(held_out: Sequence[Fit], training: Sequence[Fit], why_none: str = "") -> Verdict:
+    """The verdict on a result, from fits of `held_out` and of some `training` views. why_none: the
+    reason if none is held out."""
     if not held_out:
-        return Verdict(UNKNOWN, "No verdict: there are too few photographs to hold one out.")
+        return Verdict(UNKNOWN, f"No verdict: {why_none or 'no photograph is held out'}.")
     typical = float(np.median([fit.explained for fit in held_out]))
     poor = sorted((fit for fit in held_out if fit.explained < POOR), key=lambda fit: fit.explained)
     if typical >= TYPICAL and len(poor) <= FEW * len(held_out):

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from pathlib import Path
 
 from stages.base.atomic import rename
+from stages.base.disk import link_or_copy
 from stages.base.errors import RunFolderError
 from stages.run.failures import unusable
 from stages.run.manifest import MANIFEST, Manifest
@@ -54,12 +54,7 @@ def _copy(folder: Path, target: Path) -> None:
     manifest = Manifest.read(folder)
     own = {folder / name for name in (manifest.outputs if manifest else {})}
 
-    def link_or_copy(file: str, copied: str) -> None:
-        try:
-            if Path(file) not in own:
-                raise OSError
-            os.link(file, copied)
-        except OSError:  # not ours, or a disk without links
-            shutil.copy2(file, copied)
+    def linked_if_own(file: str, copied: str) -> None:
+        (link_or_copy if Path(file) in own else shutil.copy2)(file, copied)
 
-    shutil.copytree(folder, target, copy_function=link_or_copy)
+    shutil.copytree(folder, target, copy_function=linked_if_own)

@@ -25,6 +25,7 @@ from stages.scene.capture import (
     scene_extent,
     split_held_out,
     training_extent,
+    why_none_is_held_out,
 )
 from stages.scene.draw_settings import DrawSettings, draw_settings_of
 from stages.scene.splats import (
@@ -75,4 +76,5 @@ __all__ = [
     "scene_extent",
     "split_held_out",
     "training_extent",
+    "why_none_is_held_out",
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
@@ -109,7 +109,7 @@ class View:
         name, duplicate_of, outside: as in `Photo`.
         image, mask, depth: as in `Photo`, relative to the reconstruction's folder.
         camera: pose and intrinsics.
-        role: "train" or "test" where a benchmark defines the split; "" elsewhere.
+        role: "train" or "test" where a file defines the split, or none is held out; "" elsewhere.
         light: exposure and white balance, see `scene.light`; None if they could not be measured.
         frame: the name of the panorama or wide fisheye that this is a face of; "" for a photograph.
     """
@@ -224,6 +224,13 @@ def split_held_out(views: tuple[View, ...]) -> tuple[tuple[View, ...], tuple[Vie
         tuple(view for view, name in rows if name not in held),
         tuple(view for view, name in rows if name in held),
     )
+
+
+def why_none_is_held_out(views: Iterable[View]) -> str:
+    """The reason where `split_held_out` holds none out, as a clause."""
+    if any(view.role for view in views):
+        return "all photographs are trained on"
+    return "there are too few photographs to hold one out"
 
 
 def evenly_spaced(items: Sequence[Item], most: int) -> list[Item]:

@@ -87,6 +87,13 @@ class SfmSettings:
         wanted="An EPSG code, such as EPSG:25832.",
         midway=True,
     )
+    hold_out: bool = setting(
+        True,
+        "Hold out one photograph of every eight to measure quality on. Otherwise all are trained "
+        "on, and quality is not measured.",
+        panel="Quality and time",
+        midway=True,
+    )
     max_minutes: float = setting(
         120.0,
         "Stop with an error after this time (minutes).",
@@ -101,5 +108,6 @@ STAGE = Stage(
     version=30,
     reads=("ingest",),
     settings_type=SfmSettings,
+    adds="hold_out",
     **in_module("stages.sfm.stage"),
 )

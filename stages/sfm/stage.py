@@ -11,11 +11,12 @@ import json
 import shutil
 import time
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from stages.base.atomic import replacing
+from stages.base.disk import link_or_copy
 from stages.base.errors import ReconstructionError
 from stages.base.settings import settings_of
 from stages.base.stage import Report
@@ -35,8 +36,7 @@ from stages.sfm.settings import SfmSettings
 from stages.sfm.worker.job import Sift, prepare_work_folder, project_of
 
 _FEWEST_PHOTOGRAPHS = 3
-_FINISHED = "sfm.json"
-_WORK = "work"
+_FINISHED, _WORK = "sfm.json", "work"
 
 
 def run(
@@ -63,11 +63,13 @@ def run(
     if _is_finished(folder, settings):
         return _load_finished(folder, report)
     (folder / _FINISHED).unlink(missing_ok=True)  # by settings that have changed since
+    if earlier := _Earlier.of(settings, report):
+        return earlier.with_roles(settings, folder, report)
     if settings.cameras is not None:
         found, seconds = _from_known_cameras(capture, settings, settings.cameras, folder, report)
     else:
         found, seconds = _from_photographs(capture, settings, folder, report)
-    found = light.with_light(found, report)
+    found = _with_roles(light.with_light(found, report), settings)
     reconstruction_files.save_reconstruction(folder, found)
     report.metric("levelled", found.levelled)
     report.metric("units", found.units)
@@ -77,6 +79,51 @@ def run(
         report.metric(f"{step}_seconds", round(duration, 1))
     shutil.rmtree(folder / _WORK)
     return found
+
+
+def _with_roles(found: Reconstruction, settings: SfmSettings) -> Reconstruction:
+    """The same, whose views are all trained on if none is to be held out."""
+    if settings.hold_out:
+        return found
+    return replace(found, views=tuple(replace(view, role="train") for view in found.views))
+
+
+@dataclass(frozen=True)
+class _Earlier:
+    """An earlier output that differs in which views are held out, and in nothing else.
+
+    folder: of the output. durations: the metrics that `run` adds after writing sfm.json.
+    """
+
+    folder: Path
+    durations: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, settings: SfmSettings, report: Report) -> _Earlier | None:
+        earlier = report.earlier
+        inputs = {"ingest"} if settings.cameras is None else {"ingest", "cameras"}
+        if earlier is None or settings.split or not inputs <= earlier.same_inputs:
+            return None
+        if (earlier.settings["cameras"] is None) != (settings.cameras is None):
+            return None
+        durations = {n: v for n, v in earlier.metrics.items() if n.endswith("_seconds")}
+        return cls(earlier.folder, durations)
+
+    def with_roles(self, settings: SfmSettings, folder: Path, report: Report) -> Reconstruction:
+        """Written to `folder` as `run` would write it."""
+        shutil.rmtree(folder / _WORK, ignore_errors=True)
+        shutil.rmtree(folder / finish.COLMAP, ignore_errors=True)
+        shutil.copytree(
+            self.folder / finish.COLMAP, folder / finish.COLMAP, copy_function=link_or_copy
+        )
+        found = _load_finished(self.folder, report)
+        views = tuple(replace(view, role="") for view in found.views)
+        found = _with_roles(replace(found, folder=folder, views=views), settings)
+        reconstruction_files.save_reconstruction(folder, found)
+        _write_finished(folder, settings, report)
+        for name, value in self.durations.items():
+            report.metric(name, value)
+        return found
 
 
 def _from_photographs(

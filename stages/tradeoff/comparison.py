@@ -112,7 +112,7 @@ def compare_runs(first: Candidate, second: Candidate) -> Comparison:
             "compare-nothing-in-common",
             given=f"No photograph is held out of both {first.name} and {second.name}.",
             wanted="Photographs that neither run was trained on, to compare them by.",
-            hint="Make both runs of the same photographs, four or more.",
+            hint="Make both runs of the same photographs, four or more, without --no-hold-out.",
         )
     both = (first, second)
     side_px = min(one.side_px(name) for one in both for name in names)

@@ -22,7 +22,14 @@ from stages.evaluate.evaluation import (
     psnr_name,
 )
 from stages.evaluate.verdict import Verdict, fits, verdict
-from stages.scene import DrawSettings, Reconstruction, Splats, evenly_spaced, split_held_out
+from stages.scene import (
+    DrawSettings,
+    Reconstruction,
+    Splats,
+    evenly_spaced,
+    split_held_out,
+    why_none_is_held_out,
+)
 from stages.train.charts import contact_sheet, training_plot
 from stages.train.history import History
 
@@ -50,7 +57,7 @@ def write_quality(
     measured = [i for i, score in enumerate(scores) if score.counts]
     if measured:
         _report_scores(by_size, report)
-    else:
+    elif scores or not any(view.role for view in reconstruction.views):  # or it was asked for
         few = "Too few photographs to hold one out"
         cause = "Masks leave nothing of the held-out photographs" if scores else few
         report.warn("train-nothing-held-out", f"{cause}: quality was not measured.")
@@ -92,7 +99,8 @@ def report_verdict(
     seen = load_evaluation_views(
         reconstruction.folder, training, splats.draw_settings, report.stop_requested
     )
-    found = verdict(fits(splats, views, backend), fits(splats, seen, backend))
+    why_none = why_none_is_held_out(reconstruction.views)
+    found = verdict(fits(splats, views, backend), fits(splats, seen, backend), why_none)
     report.metric("verdict", asdict(found))
     return found
 

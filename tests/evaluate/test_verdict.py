@@ -11,7 +11,7 @@ import pytest
 from stages.base.stage import Report
 from stages.evaluate.evaluation import load_evaluation_views
 from stages.evaluate.verdict import GOOD, UNKNOWN, USABLE, WRONG, Fit, fits, verdict
-from stages.scene import Splats
+from stages.scene import Camera, Splats, View, why_none_is_held_out
 from stages.train.quality import report_verdict
 from tests.scenes import join, splats
 from tests.small_scene import small_scene
@@ -43,6 +43,14 @@ def test_the_grade_is_what_the_pictures_look_like(
     found = verdict(held_out, training)
     assert found.grade == grade
     assert said in found.text
+
+
+def test_without_a_held_out_view_the_verdict_says_why() -> None:
+    camera = Camera(4, 4, 4.0, 4.0, 2.0, 2.0, np.eye(4))
+    few = [View("a.jpg", "a.jpg", camera)]
+    wanted = [replace(view, role="train") for view in few]
+    for views, said in (few, "too few photographs"), (wanted, "all photographs are trained on"):
+        assert said in verdict([], of(0.98), why_none_is_held_out(views)).text
 
 
 def test_the_true_splats_are_not_wrong_and_others_are(tmp_path: Path) -> None:

@@ -18,9 +18,9 @@ import pytest
 from numpy.typing import NDArray
 
 from stages.base.errors import Family, SplatError
-from stages.base.stage import Report
+from stages.base.stage import Earlier, Report
 from stages.run.request import Request, settings_to_data
-from stages.scene import Capture, Reconstruction
+from stages.scene import Capture, Reconstruction, split_held_out
 from stages.sfm import stage as sfm
 from stages.sfm.checks import fallbacks
 from stages.sfm.settings import STAGE, SfmSettings
@@ -324,7 +324,7 @@ def test_what_says_how_large_the_scene_is_may_change_on_resuming() -> None:
     def key(settings: SfmSettings) -> dict[str, Any]:
         return Request(STAGE, settings_to_data(settings), {}, {}).key()
 
-    placed = SfmSettings(marker=0.05, crs="EPSG:25832", allow_partial=True)
+    placed = SfmSettings(marker=0.05, crs="EPSG:25832", allow_partial=True, hold_out=False)
     assert key(placed) == key(SfmSettings(scale=("a.jpg", "b.jpg", "1"))) == key(SfmSettings())
     assert key(SfmSettings(features="sift")) != key(SfmSettings())
 
@@ -340,6 +340,33 @@ def test_a_run_killed_after_its_end_is_not_taken_for_one_of_another_scale(
     known = replace(FEW, scale=(first, last, "3"))
     sfm.run({"ingest": bad_captures.sample(9)}, known, again, report)
     assert report.metrics["scale_source"] == f"{first} and {last} are 3 m apart"
+
+
+def test_which_views_are_held_out_changes_nothing_else_and_takes_no_search(
+    small: tuple[Reconstruction, Report, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def earlier(folder: Path, report: Report, *same: str) -> Report:
+        settings = settings_to_data(FEW)
+        return Report(
+            earlier=Earlier(folder, settings, report.metrics, report.warnings, frozenset(same))
+        )
+
+    capture, all_trained = bad_captures.sample(9), replace(FEW, hold_out=False)
+    first, first_report, first_folder = small
+    sfm.run({"ingest": capture}, all_trained, tmp_path / "whole", Report())
+    other = earlier(first_folder, first_report, "something else")
+    monkeypatch.setattr(sfm, "_from_photographs", None)
+    with pytest.raises(TypeError):  # it would search
+        sfm.run({"ingest": capture}, all_trained, tmp_path / "other", other)
+    again = earlier(first_folder, first_report, "ingest")
+    found = sfm.run({"ingest": capture}, all_trained, tmp_path / "again", again)
+    assert split_held_out(found.views)[1] == ()
+    assert split_held_out(first.views)[1]
+    assert digests(tmp_path / "again") == digests(tmp_path / "whole")
+    assert again.metrics == json.loads(json.dumps(first_report.metrics))
+    back = earlier(tmp_path / "again", again, "ingest")
+    sfm.run({"ingest": capture}, FEW, tmp_path / "back", back)
+    assert digests(tmp_path / "back") == digests(first_folder)
 
 
 def test_two_photographs_are_too_few(tmp_path: Path) -> None:
