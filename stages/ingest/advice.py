@@ -22,6 +22,7 @@ EV_RANGE_STOPS = 1.0
 DARK_BELOW = -6.5  # log2 of linear luminance: about 30 of 255
 SMALL_BELOW_PX = 640
 _NAMED = 8
+_HINTS = 2  # in an error about many files
 
 
 TEXTS = {  # by code, in the order of the warnings; {names} of files or photographs
@@ -198,10 +199,14 @@ def too_few(
     if unusable:
         few = "; ".join(f"{name}: {why}" for name, why, _ in unusable[:3])
         more = f"; and {len(unusable) - 3} more" if len(unusable) > 3 else ""
-        given = f"{given[:-1]}; {len(unusable)} could not be read ({few}{more})."
+        given = f"{given[:-1]}; {len(unusable)} could not be used ({few}{more})."
+    hint = "Take photographs in small steps around the scene, with 60-80 % overlap."
+    if unusable and usable + len(unusable) >= fewest:  # there would be enough
+        usual = Counter(what_to_do for *_, what_to_do in unusable).most_common(_HINTS)
+        hint = " ".join(f"{what_to_do}." for what_to_do, _ in usual)
     return SplatError(
         "ingest-too-few-photographs",
         given=given,
         wanted=f"At least {fewest}; an object or a room needs 20 to 50.",
-        hint="Take photographs in small steps around the scene, with 60-80 % overlap.",
+        hint=hint,
     )
