@@ -8,5 +8,5 @@ In reading order:
 - A video: `video_frames` (all steps), `video`, `video_colour`, `frame_selection`.
 - `masking` applies masks, `quality` measures pictures, `write` and `capture_file` write them, and
   `advice` warns.
-- For known cameras: `fisheye_faces`, `image_circle`.
+- For structure from motion: `fisheye_faces` (of known cameras), `image_circle`.
 """

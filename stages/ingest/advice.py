@@ -22,6 +22,7 @@ EV_RANGE_STOPS = 1.0
 DARK_BELOW = -6.5  # log2 of linear luminance: about 30 of 255
 SMALL_BELOW_PX = 640
 _NAMED = 8
+_HINTS = 2  # in an error about many files
 
 
 TEXTS = {  # by code, in the order of the warnings; {names} of files or photographs
@@ -102,7 +103,8 @@ def about_left_out(code: str, unusable: Sequence[tuple[str, str, str]], warn: Wa
 
 
 def about_capture(photos: Sequence[Photo], warn: Warn) -> list[str]:
-    """Warns about the capture as a whole; returns the names of blurred photographs."""
+    """Warns about the capture as a whole; returns the names of blurred photographs. Of a panorama
+    `photos` holds one face, whose size is not the panorama's."""
     panoramas = sum(photo.face is not None for photo in photos)
     if len(photos) < FEWEST_WITHOUT_WARNING and panoramas < FEWEST_PANORAMAS:
         what = "usable photograph"
@@ -110,7 +112,7 @@ def about_capture(photos: Sequence[Photo], warn: Warn) -> list[str]:
             "An object or a room needs 20 to 50: take more, in small steps around the scene, with "
             "60-80 % overlap."
         )
-        if all(photo.camera.startswith("video, ") for photo in photos):
+        if all(_is_frame(photo) for photo in photos):
             what = "different frame"
             wanted = "An object or a room needs 20 to 50: film on while you walk around the scene."
         if panoramas == len(photos):
@@ -125,10 +127,11 @@ def about_capture(photos: Sequence[Photo], warn: Warn) -> list[str]:
             "Most photographs are blurred or have been enlarged: they hold little fine detail. "
             "Use the camera's original files, hold it still and check the focus.",
         )
-    sides = [(max(photo.width, photo.height), photo.name) for photo in photos]
+    frames = {photo.name for photo in photos if _is_frame(photo)}  # nobody can take them again
+    sides = [(max(p.width, p.height), p.name) for p in photos if p.face is None]
     about_names(
         {
-            "ingest-blurred": blurred,
+            "ingest-blurred": [name for name in blurred if name not in frames],
             "ingest-small": [name for side, name in sides if side < SMALL_BELOW_PX],
             "ingest-dark": [p.name for p in photos if p.log2_luminance < DARK_BELOW],
         },
@@ -137,6 +140,11 @@ def about_capture(photos: Sequence[Photo], warn: Warn) -> list[str]:
     _about_light(photos, warn)
     _about_cameras(photos, warn)
     return blurred
+
+
+def _is_frame(photo: Photo) -> bool:
+    """Whether it is a frame of a video."""
+    return photo.camera.startswith("video, ")
 
 
 def _about_light(photos: Sequence[Photo], warn: Warn) -> None:
@@ -198,10 +206,14 @@ def too_few(
     if unusable:
         few = "; ".join(f"{name}: {why}" for name, why, _ in unusable[:3])
         more = f"; and {len(unusable) - 3} more" if len(unusable) > 3 else ""
-        given = f"{given[:-1]}; {len(unusable)} could not be read ({few}{more})."
+        given = f"{given[:-1]}; {len(unusable)} could not be used ({few}{more})."
+    hint = "Take photographs in small steps around the scene, with 60-80 % overlap."
+    if unusable and usable + len(unusable) >= fewest:  # there would be enough
+        usual = Counter(what_to_do for *_, what_to_do in unusable).most_common(_HINTS)
+        hint = " ".join(f"{what_to_do}." for what_to_do, _ in usual)
     return SplatError(
         "ingest-too-few-photographs",
         given=given,
         wanted=f"At least {fewest}; an object or a room needs 20 to 50.",
-        hint="Take photographs in small steps around the scene, with 60-80 % overlap.",
+        hint=hint,
     )

@@ -24,6 +24,7 @@ from stages.base.text import counted, listed
 from stages.scene import Capture, Reconstruction
 from stages.sfm import finish, light, reconstruction_files
 from stages.sfm.checks import acceptance, attempt_runner, fallbacks, gates
+from stages.sfm.checks.circular_fisheye import warn_of_circular_fisheye
 from stages.sfm.checks.gates import MOVE
 from stages.sfm.checks.same_place import check_one_place
 from stages.sfm.known.reconstruct import reconstruct
@@ -134,6 +135,7 @@ def _from_photographs(
 ) -> tuple[Reconstruction, dict[str, float]]:
     """(the reconstruction, seconds by step)."""
     check_duplicates(capture, report)
+    warn_of_circular_fisheye(capture, report)
     if not settings.allow_partial and all(photo.face is None for photo in capture.photos):
         check_one_place(capture.folder, capture.photos)
     features = usable_features(settings.features, report)

@@ -126,13 +126,14 @@ def _warn_of_small_photographs(
 ) -> None:
     if not settings.steps:
         return
-    train_side = settings.train_side
-    sides = [max(view.camera.width, view.camera.height) for view in reconstruction.views]
-    if smaller := sum(side < train_side for side in sides):
+    side = settings.train_side
+    views = [v for v in reconstruction.views if max(v.camera.width, v.camera.height) < side]
+    if smaller := len({view.frame or view.name for view in views}):
         report.warn(
             "train-photographs-smaller",
-            f"Used at their own size, smaller than --train-side {train_side}: "
-            f"{counted(smaller, 'photograph')}. --max-side sets how large ingest keeps them.",
+            f"Used at their own size, smaller than --train-side {side}: "
+            f"{counted(smaller, 'photograph')}. A larger --max-side helps only where ingest made "
+            "them so small.",
         )
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
-from stages.ingest.image_circle import brightest, circle_radius
+from stages.ingest.image_circle import always_same_circle, brightest, circle_radius
 from stages.scene import Camera
+from tests.ingest.made_files import textured
 
 
 def photographs(side: int, radius: float, count: int = 4, dx: float = 0.0) -> list[np.ndarray]:
@@ -75,3 +77,72 @@ def test_a_dark_corner_is_not_a_circle() -> None:
 
 def test_black_photographs_have_none() -> None:
     assert circle_radius(brightest([np.zeros((300, 300, 3), np.uint8)]), square(300)) == np.inf
+
+
+WIDTH, HEIGHT = 320, 240
+X, Y = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
+AWAY = np.hypot(X, Y) / (HEIGHT / 2)
+
+
+def lit_by(*shares: np.ndarray) -> list[np.ndarray]:
+    """Pictures of a textured scene in such shares of its light, over the noise of a dark sensor."""
+    random = np.random.default_rng(0)
+    found = []
+    for number, share in enumerate(shares):
+        scene = 60 + 0.7 * textured(number, WIDTH, HEIGHT)
+        dark = random.integers(0, 6, scene.shape)
+        found.append(np.clip(scene * share[..., None] + dark, 0, 255).astype(np.uint8))
+    return found
+
+
+def disc(radius: float = 0.95, dx: float = 0.0, height: float = 1.0) -> np.ndarray:
+    return (np.hypot(2 * X / HEIGHT - dx, 2 * Y / HEIGHT / height) < radius).astype(float)
+
+
+LENS = {
+    "circular": [disc()] * 4,
+    "beside the middle": [disc(0.92, dx=0.04)] * 4,
+    "cut off above and below": [disc(1.2)] * 4,
+    "in most pictures": [disc()] * 3 + [disc(9.0)] * 2,
+    "with somebody in black below": [np.where((Y > 60) & (abs(X) < 50), 0, disc())] * 4,
+    "of little light": [0.3 * disc()] * 4,
+}
+NO_LENS = {
+    "an ordinary lens": [disc(9.0)] * 4,
+    "vignetting": [np.cos(np.arctan(1.2 * AWAY)) ** 4] * 4,
+    "a torch": [1 / (1 + np.exp((AWAY - 0.9) / 0.1))] * 4,
+    "a flash": [np.exp(-((AWAY / 0.6) ** 2))] * 4,
+    "a dark night": [np.full(AWAY.shape, 0.02)] * 4,
+    "a ball before black": [disc(0.7)] * 4,
+    "a ball before black, by hand": [disc(r) for r in (0.82, 0.87, 0.92, 0.97)],
+    "a plate before black": [disc(0.95, height=0.8)] * 4,
+    "a box before black": [((abs(X) < 90) & (abs(Y) < 100)).astype(float)] * 4,
+    "black bars above and below": [(abs(Y) < 90).astype(float)] * 4,
+    "narrow bars above and below": [(abs(Y) < 100).astype(float)] * 4,
+    "black bars at the sides": [(abs(X) < 120).astype(float)] * 4,
+    "a circle in one picture": [disc(), *[disc(9.0)] * 3],
+}
+
+
+@pytest.mark.parametrize("shares", LENS.values(), ids=LENS.keys())
+def test_an_unknown_lens_shows_the_same_circle_in_most_pictures(shares: list[np.ndarray]) -> None:
+    assert always_same_circle(lit_by(*shares))
+
+
+@pytest.mark.parametrize("shares", NO_LENS.values(), ids=NO_LENS.keys())
+def test_what_is_dark_around_its_middle_is_no_lens(shares: list[np.ndarray]) -> None:
+    assert not always_same_circle(lit_by(*shares))
+
+
+def test_lights_of_a_night_are_no_lens() -> None:
+    random = np.random.default_rng(0)
+    pictures = lit_by(*[np.zeros(AWAY.shape)] * 4)
+    for picture in pictures:
+        for at in random.integers((0, 0), (WIDTH, HEIGHT), (25, 2)):
+            middle = int(at[0]), int(at[1])
+            cv2.circle(picture, middle, int(random.integers(2, 20)), (200, 220, 250), -1)
+    assert not always_same_circle(pictures)
+
+
+def test_no_pictures_show_none() -> None:
+    assert not always_same_circle([])

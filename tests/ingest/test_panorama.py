@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from stages.base.errors import SplatError
 from stages.base.stage import Report
 from stages.ingest import stage as ingest
 from stages.ingest.panorama import SPHERE, panorama, projection_of
@@ -120,6 +121,28 @@ def test_two_fisheyes_among_photographs_are_left_out_by_name(tmp_path: Path) -> 
     (message,) = [text for code, text in report.warnings if code == "ingest-left-out"]
     assert "two.png is left out: it is a pair of fisheye pictures side by side" in message
     assert "Stitch it" in message
+
+
+PART = (
+    b'<rdf:Description GPano:ProjectionType="equirectangular" GPano:FullPanoWidthPixels="1024" '
+    b'GPano:CroppedAreaImageWidthPixels="512"/>'
+)
+
+
+@pytest.mark.parametrize(("part", "advice"), [(False, "Stitch it in"), (True, "Export the whole")])
+def test_panoramas_that_cannot_be_cut_are_an_error_that_says_what_to_do(
+    tmp_path: Path, part: bool, advice: str
+) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for number in range(3):
+        pixels = sphere(number)[:, :300] if part else two_fisheyes(number)
+        Image.fromarray(pixels).save(photos / f"{number}.jpg", xmp=PART if part else b"")
+    with pytest.raises(SplatError) as caught:
+        ingest.run({"photos": photos}, IngestSettings(), tmp_path / "out", Report())
+    assert caught.value.code == "ingest-too-few-photographs"
+    assert caught.value.hint.startswith(advice)
+    assert "in small steps" not in caught.value.hint
 
 
 @pytest.mark.parametrize(("ordinary", "faces"), [(3, False), (1, True)])

@@ -133,5 +133,17 @@ def test_twelve_panoramas_are_enough_for_a_room() -> None:
     assert "11 usable 360-degree pictures. A room needs about 12" in few["ingest-few-photographs"]
 
 
+def test_a_small_face_is_no_small_panorama() -> None:
+    face = Face("rig", "a.jpg", (1.0, 0.0, 0.0, 0.0))
+    assert codes([photo(i, face=face, width=592, height=592) for i in range(12)]) == {}
+
+
+def test_nobody_is_told_to_take_a_frame_of_a_video_again() -> None:
+    film = {"camera": "video, 1600x1200 a.mp4", "sharpness": 3.0}
+    assert "ingest-blurred" not in codes([*MANY, photo(99, **film)])
+    both = codes([*MANY, photo(98, sharpness=3.0), photo(99, **film)])
+    assert "98.jpg. Take" in both["ingest-blurred"]
+
+
 def test_long_lists_of_names_are_cut() -> None:
     assert listed([str(i) for i in range(11)]) == "0, 1, 2, 3, 4, 5, 6, 7 and 3 more"

@@ -437,6 +437,7 @@ def test_fewer_than_three_usable_photographs_are_an_error(tmp_path: Path, usable
     assert error.code == "ingest-too-few-photographs"
     assert f"{usable} usable" in error.given
     assert "broken.png" in error.given
+    assert error.hint.startswith("Copy it" if usable == 2 else "Take photographs")
 
 
 def test_a_full_disk_is_an_error_and_leaves_no_half_picture(
