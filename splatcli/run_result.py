@@ -77,7 +77,17 @@ def show(pipeline: Pipeline, until: str | None) -> None:
     if verdict:
         console.out.print()
         console.paragraph(console.out, styled(verdict))
-        console.out.print(f"Look at it: splat view {quoted(pipeline.run_folder)}", markup=False)
+        run = quoted(pipeline.run_folder)
+        console.out.print(f"Look at it: splat view {run}", markup=False)
+        if until is None and verdict["grade"] in (GOOD, USABLE) and _holds_out(by_stage["sfm"]):
+            command = f"splat process {run} --out final --no-hold-out"
+            console.out.print(f"Train on all photographs: {command}", markup=False)
+
+
+def _holds_out(reconstruction: Manifest) -> bool:
+    """Whether the run holds photographs out that a file does not define as test photographs."""
+    settings = reconstruction.settings
+    return bool(settings.get("hold_out")) and not settings.get("split")
 
 
 def styled(verdict: Mapping[str, str]) -> Text:

@@ -57,7 +57,7 @@ def write_quality(
     measured = [i for i, score in enumerate(scores) if score.counts]
     if measured:
         _report_scores(by_size, report)
-    elif scores or not any(view.role for view in reconstruction.views):  # or it was asked for
+    elif scores or not any(view.role for view in reconstruction.views):  # else the user wants none
         few = "Too few photographs to hold one out"
         cause = "Masks leave nothing of the held-out photographs" if scores else few
         report.warn("train-nothing-held-out", f"{cause}: quality was not measured.")

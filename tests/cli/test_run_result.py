@@ -27,9 +27,10 @@ def shown(
     steps: int = 3150,
     run: str = "run",
     pruning: dict[str, Any] | None = None,
+    until: str | None = "train",
 ) -> str:
-    """The output for a run of `sfm` and `train`, this with `settings`, and of `prune` with the
-    metrics `pruning`."""
+    """The output for a run of `sfm` and `train` with `settings`, and of `prune` with the metrics
+    `pruning`."""
     metrics: dict[str, Any] = {
         "sfm": {"unregistered_images": ["b.jpg"]},
         "train": {"verdict": verdict},
@@ -57,7 +58,7 @@ def shown(
         stage_folder=lambda name: Path(run) / name,
         run_folder=Path(run),
     )
-    run_result.show(pipeline, "train")
+    run_result.show(pipeline, until)
     return capsys.readouterr().out
 
 
@@ -69,6 +70,24 @@ def test_the_last_lines_are_the_verdict_and_how_to_look_at_the_result(
     assert lines[-1] == "Look at it: splat view run"
     lines = shown(capsys, {"grade": "usable", "text": "It is soft."}, run="my run").splitlines()
     assert lines[-1] == "Look at it: splat view 'my run'"
+
+
+def test_all_photographs_are_offered_once_quality_is_measured(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def last(grade: str, until: str | None = None, **settings: bool) -> str:
+        text = {"grade": grade, "text": "It is so."}
+        return shown(capsys, text, settings, until=until).splitlines()[-1]
+
+    offered = "Train on all photographs: splat process run --out final --no-hold-out"
+    assert last("good", hold_out=True) == last("usable", hold_out=True) == offered
+    for other in (
+        last("wrong", hold_out=True),
+        last("good", "train", hold_out=True),
+        last("good", hold_out=False),
+        last("good", hold_out=True, split=True),  # a benchmark's test photographs
+    ):
+        assert other == "Look at it: splat view run"
 
 
 def test_a_terminal_breaks_the_verdict_between_words(
