@@ -79,15 +79,17 @@ def show(pipeline: Pipeline, until: str | None) -> None:
         console.paragraph(console.out, styled(verdict))
         run = quoted(pipeline.run_folder)
         console.out.print(f"Look at it: splat view {run}", markup=False)
-        if until is None and verdict["grade"] in (GOOD, USABLE) and _holds_out(by_stage["sfm"]):
+        if until is None and verdict["grade"] in (GOOD, USABLE) and _would_gain(by_stage):
             command = f"splat process {run} --out final --no-hold-out"
             console.out.print(f"Train on all photographs: {command}", markup=False)
 
 
-def _holds_out(reconstruction: Manifest) -> bool:
-    """Whether the run holds photographs out that a file does not define as test photographs."""
-    settings = reconstruction.settings
-    return bool(settings.get("hold_out")) and not settings.get("split")
+def _would_gain(by_stage: Mapping[str, Manifest]) -> bool:
+    """Whether the run holds photographs out that are no test photographs of a file, and has so few
+    that a training on all is better (docs/experiments/evaluation.md)."""
+    settings, training = by_stage["sfm"].settings, by_stage["train"].metrics
+    held_out = settings.get("hold_out") and not settings.get("split")
+    return bool(held_out) and 0 < training.get("training_views", 0) <= _FEW_VIEWS
 
 
 def styled(verdict: Mapping[str, str]) -> Text:

@@ -75,15 +75,16 @@ def test_the_last_lines_are_the_verdict_and_how_to_look_at_the_result(
 def test_all_photographs_are_offered_once_quality_is_measured(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    def last(grade: str, until: str | None = None, **settings: bool) -> str:
+    def last(grade: str, until: str | None = None, views: int = 21, **settings: bool) -> str:
         text = {"grade": grade, "text": "It is so."}
-        return shown(capsys, text, settings, until=until).splitlines()[-1]
+        return shown(capsys, text, settings, views=views, until=until).splitlines()[-1]
 
     offered = "Train on all photographs: splat process run --out final --no-hold-out"
     assert last("good", hold_out=True) == last("usable", hold_out=True) == offered
     for other in (
         last("wrong", hold_out=True),
         last("good", "train", hold_out=True),
+        last("good", views=26, hold_out=True),
         last("good", hold_out=False),
         last("good", hold_out=True, split=True),  # a benchmark's test photographs
     ):
