@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
+from itertools import chain, count
+from pathlib import Path
 from typing import Any
 
 from rich.text import Text
@@ -69,9 +72,9 @@ def show(pipeline: Pipeline, until: str | None) -> None:
         )
     else:
         console.out.print(Text(f"\nIn {pipeline.stage_folder(reached[-1])}"))
-    count = sum(len(manifest.warnings) for manifest in manifests)
-    if until is None and count:
-        console.note(f"\n{counted(count, 'warning')}, of all stages:")
+    warnings = sum(len(manifest.warnings) for manifest in manifests)
+    if until is None and warnings:
+        console.note(f"\n{counted(warnings, 'warning')}, of all stages:")
         for manifest in manifests:
             progress.warn(manifest)
     if verdict:
@@ -80,8 +83,17 @@ def show(pipeline: Pipeline, until: str | None) -> None:
         run = quoted(pipeline.run_folder)
         console.out.print(f"Look at it: splat view {run}", markup=False)
         if until is None and verdict["grade"] in (GOOD, USABLE) and _would_gain(by_stage):
-            command = f"splat process {run} --out final --no-hold-out"
+            free = quoted(_free_name_beside(pipeline.run_folder))
+            command = f"splat process {run} --out {free} --no-hold-out"
             console.out.print(f"Train on all photographs: {command}", markup=False)
+
+
+def _free_name_beside(run_folder: Path) -> Path:
+    """A folder that does not exist, so that the command continues no earlier run."""
+    whole = run_folder if run_folder.name not in ("", "..") else run_folder.resolve()
+    names = chain(["final"], (f"final-{number}" for number in count(2)))
+    places = (whole.with_name(f"{whole.name}-{name}") for name in names)
+    return next(place for place in places if not os.path.lexists(place))
 
 
 def _would_gain(by_stage: Mapping[str, Manifest]) -> bool:

@@ -86,7 +86,7 @@ def _run_folder_and_photos(photos: Path | None, out: Path | None) -> tuple[Path,
                 "option-out",
                 given=f"{photos} and {out} are runs of different photographs.",
                 wanted=f"A new folder, for a run that begins as {photos}, or one made so.",
-                hint=f"Leave --out away to continue {photos}.",
+                hint="Name another folder with --out.",
             )
         return out, None
     folder = out or run_folder_for(photos)

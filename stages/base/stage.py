@@ -34,6 +34,7 @@ class Earlier:
         settings: as plain data.
         metrics, warnings: as reported then.
         same_inputs: names of the inputs that have not changed.
+        outputs: relative paths of the files that the stage wrote; others may lie beside them.
     """
 
     folder: Path
@@ -41,6 +42,7 @@ class Earlier:
     metrics: Mapping[str, Any]
     warnings: Sequence[Sequence[str]]
     same_inputs: frozenset[str]
+    outputs: frozenset[str] = frozenset()
 
 
 @dataclass

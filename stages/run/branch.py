@@ -57,4 +57,5 @@ def _copy(folder: Path, target: Path) -> None:
     def linked_if_own(file: str, copied: str) -> None:
         (link_or_copy if Path(file) in own else shutil.copy2)(file, copied)
 
-    shutil.copytree(folder, target, copy_function=linked_if_own)
+    # Links of others may lead nowhere, or to large folders.
+    shutil.copytree(folder, target, symlinks=True, copy_function=linked_if_own)

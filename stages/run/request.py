@@ -83,7 +83,8 @@ def earlier_of(request: Request, done: Manifest | None, folder: Path) -> Earlier
     if damage(folder, done.outputs, read_all=True):
         return None
     same = frozenset(n for n, digest in request.inputs.items() if done.inputs.get(n) == digest)
-    return Earlier(folder, done.settings, done.metrics, done.warnings, same)
+    outputs = frozenset(done.outputs)
+    return Earlier(folder, done.settings, done.metrics, done.warnings, same, outputs)
 
 
 def why_again(request: Request, done: Manifest) -> list[str]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -93,10 +93,12 @@ def _with_roles(found: Reconstruction, settings: SfmSettings) -> Reconstruction:
 class _Earlier:
     """An earlier output that differs in which views are held out, and in nothing else.
 
-    folder: of the output. durations: the metrics that `run` adds after writing sfm.json.
+    folder: of the output. pictures: relative paths of its pictures, masks, depth maps and COLMAP
+    model. durations: the metrics that `run` adds after writing sfm.json.
     """
 
     folder: Path
+    pictures: Sequence[str]
     durations: Mapping[str, Any]
 
     @classmethod
@@ -107,16 +109,17 @@ class _Earlier:
             return None
         if (earlier.settings["cameras"] is None) != (settings.cameras is None):
             return None
+        pictures = sorted(n for n in earlier.outputs if n.startswith(f"{finish.COLMAP}/"))
         durations = {n: v for n, v in earlier.metrics.items() if n.endswith("_seconds")}
-        return cls(earlier.folder, durations)
+        return cls(earlier.folder, pictures, durations)
 
     def with_roles(self, settings: SfmSettings, folder: Path, report: Report) -> Reconstruction:
         """Written to `folder` as `run` would write it."""
         shutil.rmtree(folder / _WORK, ignore_errors=True)
         shutil.rmtree(folder / finish.COLMAP, ignore_errors=True)
-        shutil.copytree(
-            self.folder / finish.COLMAP, folder / finish.COLMAP, copy_function=link_or_copy
-        )
+        for name in self.pictures:
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            link_or_copy(str(self.folder / name), str(folder / name))
         found = _load_finished(self.folder, report)
         views = tuple(replace(view, role="") for view in found.views)
         found = _with_roles(replace(found, folder=folder, views=views), settings)

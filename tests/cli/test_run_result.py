@@ -73,14 +73,18 @@ def test_the_last_lines_are_the_verdict_and_how_to_look_at_the_result(
 
 
 def test_all_photographs_are_offered_once_quality_is_measured(
-    capsys: pytest.CaptureFixture[str],
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.chdir(tmp_path)
+
     def last(grade: str, until: str | None = None, views: int = 21, **settings: bool) -> str:
         text = {"grade": grade, "text": "It is so."}
         return shown(capsys, text, settings, views=views, until=until).splitlines()[-1]
 
-    offered = "Train on all photographs: splat process run --out final --no-hold-out"
+    offered = "Train on all photographs: splat process run --out run-final --no-hold-out"
     assert last("good", hold_out=True) == last("usable", hold_out=True) == offered
+    Path("run-final").mkdir()  # an earlier one, which the command would continue
+    assert "--out run-final-2 " in last("good", hold_out=True)
     for other in (
         last("wrong", hold_out=True),
         last("good", "train", hold_out=True),

@@ -56,6 +56,17 @@ def test_a_file_of_the_users_own_is_copied(run: Path, tmp_path: Path) -> None:
     assert (tmp_path / "second" / "2-count" / "notes.txt").read_text() == "mine"
 
 
+def test_links_of_others_stay_links(run: Path, tmp_path: Path) -> None:
+    """They may lead nowhere, or to a folder that is large."""
+    (tmp_path / "large").mkdir()
+    links = {"nowhere": tmp_path / "missing", "away": tmp_path / "large"}
+    for name, place in links.items():
+        (run / "2-count" / name).symlink_to(place)
+    branch(run, tmp_path / "second")
+    for name, place in links.items():
+        assert (tmp_path / "second" / "2-count" / name).readlink() == place
+
+
 def test_a_run_among_the_photographs_is_refused(run: Path, tmp_path: Path) -> None:
     """Ingest would read its pictures."""
     with pytest.raises(SplatError) as caught:

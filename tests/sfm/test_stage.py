@@ -348,18 +348,24 @@ def test_which_views_are_held_out_changes_nothing_else_and_takes_no_search(
     def earlier(folder: Path, report: Report, *same: str) -> Report:
         settings = settings_to_data(FEW)
         return Report(
-            earlier=Earlier(folder, settings, report.metrics, report.warnings, frozenset(same))
+            earlier=Earlier(
+                folder, settings, report.metrics, report.warnings, frozenset(same), outputs
+            )
         )
 
     capture, all_trained = bad_captures.sample(9), replace(FEW, hold_out=False)
     first, first_report, first_folder = small
+    outputs = frozenset(digests(first_folder))
     sfm.run({"ingest": capture}, all_trained, tmp_path / "whole", Report())
     other = earlier(first_folder, first_report, "something else")
     monkeypatch.setattr(sfm, "_from_photographs", None)
     with pytest.raises(TypeError):  # it would search
         sfm.run({"ingest": capture}, all_trained, tmp_path / "other", other)
     again = earlier(first_folder, first_report, "ingest")
+    foreign = first_folder / "colmap" / "images" / ".DS_Store"
+    foreign.write_text("of the Finder")
     found = sfm.run({"ingest": capture}, all_trained, tmp_path / "again", again)
+    foreign.unlink()
     assert split_held_out(found.views)[1] == ()
     assert split_held_out(first.views)[1]
     assert digests(tmp_path / "again") == digests(tmp_path / "whole")
