@@ -23,7 +23,7 @@ _LIT_SHARE = 0.95  # of that share: what the last ring within it has at least
 _FEWEST = 32  # pixels of a ring; the outermost rings are a few pixels in the corners
 _WITHIN = 0.9  # of the rim's radius: from where on rings say how much is lit
 _MARGIN = 0.01  # of the radius, for the blurred rim
-_LARGE = 0.8  # of half the shorter side: the least radius of a circle whose lens is not known
+_LARGE = 0.8  # of half the shorter side: the least radius where the lens is not known
 _SAME = 0.03  # by which its radius may differ between photographs
 _BRIGHT = 2 * _DARK  # what is seen just within such a circle, above black
 _FALL = 0.5  # of what is seen further within; the light of a torch or a flash falls off more
@@ -69,7 +69,7 @@ def circle_radius(lit: NDArray[np.uint8], camera: Camera) -> float:
 
 
 def always_same_circle(pictures: Iterable[NDArray[np.uint8]]) -> bool:
-    """Whether most pictures [H, W, 3] show one image circle, whose lens is not known.
+    """Whether most pictures [H, W, 3] show one image circle. The lens need not be known.
 
     An object before black is smaller, or of another size in each picture.
     """

@@ -1,4 +1,4 @@
-"""Warns of photographs of a circular fisheye, whose cameras only a file can state."""
+"""Warns of circular fisheye pictures without known cameras."""
 
 from __future__ import annotations
 
