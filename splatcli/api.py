@@ -50,6 +50,7 @@ class Options(TypedDict, total=False):
     scale: tuple[str, ...]
     marker: float
     crs: str
+    hold_out: bool
     max_minutes: float
     splats: Path | None
     densify: bool

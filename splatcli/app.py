@@ -133,7 +133,7 @@ ENTRIES = {
         panel="Look and measure",
     ),
     "compare": Entry(
-        "Compare two runs: better, worse, or inconclusive.",
+        "Compare two runs: better, worse, or no significant difference.",
         "splat compare run/ other-run/",
         _RESULT,
         panel="Look and measure",

@@ -17,6 +17,7 @@ from stages.raster.backends import CHOICES
 _INSTALL_RAY = install_command("cluster").replace("[", r"\[")  # in rich markup
 
 ENDINGS = ", ".join(f".{ending}" for ending in FORMATS)
+STREAMED = "FOLDER/lod-meta.json and FOLDER/tileset.json"
 
 Photos = Annotated[
     Path | None,

@@ -31,7 +31,7 @@ def compare(
         Path, typer.Option("--out", "-o", metavar="PATH", help="Folder for the report.")
     ] = Path("comparison"),
 ) -> None:
-    """Compare two runs: better, worse, or inconclusive.
+    """Compare two runs: better, worse, or no significant difference.
 
     Both are evaluated at one size, view by view, on photographs that neither was trained on.
     """

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from splatcli import console
-from splatcli.arguments import ENDINGS, NoClobber
+from splatcli.arguments import ENDINGS, STREAMED, NoClobber
 from stages import formats
 from stages.base import scratch
 from stages.base.atomic import make_folder
@@ -31,7 +31,10 @@ _UNSEEN_DB = 40.0  # PSNR above which pictures of 8 bits look alike, an error of
 
 def convert(
     source: Annotated[Path, typer.Argument(help="Splat file to read; its name says the format.")],
-    target: Annotated[Path, typer.Argument(help=f"Splat file to write: {ENDINGS}.")],
+    target: Annotated[
+        Path,
+        typer.Argument(help=f"Splat file to write: {ENDINGS}; {STREAMED} to stream."),
+    ],
     *,
     no_clobber: NoClobber = False,
 ) -> None:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from splatcli import console
-from splatcli.arguments import ENDINGS, NoClobber
+from splatcli.arguments import ENDINGS, STREAMED, NoClobber
 from splatcli.folders import load_target
 from splatcli.operation_options import parsed_operations
 from stages import formats
@@ -37,7 +37,7 @@ def edit(
     source: Annotated[Path, typer.Argument(help="Splat file, or a run folder for its splats.")],
     target: Annotated[
         Path | None,
-        typer.Argument(help=f"Splat file to write: {ENDINGS}; FOLDER/lod-meta.json to stream."),
+        typer.Argument(help=f"Splat file to write: {ENDINGS}; {STREAMED} to stream."),
     ] = None,
     *,
     dry_run: Annotated[

@@ -62,7 +62,11 @@ class PruneSettings:
         max=100_000,
     )
     seconds: float = setting(
-        0.0, "Time limit in seconds: no round begins after it. 0: no limit.", min=0, max=1e7
+        0.0,
+        "Time limit (seconds): afterwards only rounds that --max-splats or --max-mb needs begin. "
+        "0: no limit.",
+        min=0,
+        max=1e7,
     )
     allow_partial: bool = setting(
         False, "Go on with a result that is wrong because photographs contradict each other."
