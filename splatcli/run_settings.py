@@ -182,8 +182,14 @@ def _with_preset(train: TrainSettings, preset: str) -> TrainSettings:
 def of_new_run(given: Mapping[str, Any]) -> dict[str, Any]:
     """Settings by stage name of a new run with the given options, "preset" included. Raises
     SplatError."""
+    return with_options(defaults(), given)
+
+
+def with_options(base: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """`base` (settings by stage name) changed by the given options, "preset" included. Raises
+    SplatError."""
     others = {name: value for name, value in given.items() if name != "preset"}
-    return combined(defaults(), others, given.get("preset"))
+    return combined(base, others, given.get("preset"))
 
 
 def training_summary(settings: TrainSettings, given: Mapping[str, Any], preset: str | None) -> str:

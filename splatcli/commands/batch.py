@@ -73,12 +73,11 @@ def _settings(
     """Settings by stage name of the run `name`, whose records are copied to `local_folder` from a
     URL. Raises SplatError."""
     remote.fetch_records(runs, name, local_folder)
-    others = {key: value for key, value in given.items() if key != "preset"}
     try:
         recorded = run_settings.recorded(Pipeline(local_folder / name))
     except SplatError:  # the run itself will fail by it, and the others go on
         recorded = run_settings.defaults()
-    return run_settings.combined(recorded, others, given.get("preset"))
+    return run_settings.with_options(recorded, given)
 
 
 def _report(row: Row, result: TaskResult) -> None:
